@@ -9,6 +9,7 @@ from refusals import refused
 import servoctl as sv
 from servoctl.errors import unknown
 from servoctl.gallery import gallery, trailers
+from servoctl.model.start import State
 
 
 def two_link_arm():
@@ -507,3 +508,20 @@ def test_a_program_that_determines_velocities_but_not_all_coordinates_is_integra
     s = 3 * np.ravel(cf.rest_to_rest(run.t, 0, 0.0, 1.0, 4.0, 6)) + run.t
     assert run["x"] == pytest.approx(s, abs=1e-7) and run["y"] == pytest.approx(s**2 / 3, abs=1e-7)
     assert sv.verify(model, run).passed
+
+
+def test_a_search_that_ends_where_an_equation_has_no_gradient_says_so():
+    """max(x - 1, 0) = 1 has the solution x = 2, and below x = 1, where the search begins, no gradient."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
+    model = sv.derive(mechanism, sv.Program({"edge": ca.fmax(x - 1.0, 0.0) - 1.0}, by="ideal"), guess={"x": 3.0})
+    assert model.start(guess={"x": 3.0})["x"] == pytest.approx(2.0)
+    with refused(sv.InconsistentStart, "'edge' has no gradient", invariant="edge"):
+        model.start()
+
+
+def test_a_printed_state_has_zeros_for_rounding_and_held_values_as_they_are():
+    values, names = np.array([2.0, -1.8e-17, 1e-9, 1e-20]), ("x", "y", "z", "w")
+    assert "x = 2, y = 0, z = 1e-09, w = 1e-20" in repr(State(0.0, values, names, ("w",), (), 0.0))
+    assert "x = 2e-06, y = 0, z = 1e-15, w = 0" in repr(State(0.0, 1e-6 * values, names, (), (), 0.0))
