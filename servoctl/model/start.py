@@ -30,7 +30,7 @@ SEARCH_STEPS = 20  # of Newton's method from each
 NEARER = 0.25  # of the way from one such state to another: a reference before it is clearly nearer the first
 DISTINCT = 1e-3  # difference of two such states, relative to their size
 SHOWN = 3  # values by which a printed state tells branches apart
-ROUNDING = 1e-14  # of the largest value: a smaller one that is not held is printed as zero
+PRINTED_ZERO = 1e-14  # of the largest value: a smaller one that is not held is printed as zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class State(Value, Shown):
     def _without_rounding(self):
         """The values, with zeros for those that Newton's method leaves as rounding of the largest, (n_x,)."""
         size = np.abs(self.values)
-        shown = np.isin(self.names, self.held) | (size > ROUNDING * size.max(initial=0.0))
+        shown = np.isin(self.names, self.held) | (size > PRINTED_ZERO * size.max(initial=0.0))
         return np.where(shown, self.values, 0.0)
 
     def _told_apart(self):
