@@ -1,12 +1,14 @@
 """Many motions at once: equal to `simulate` case by case, failures as rows, and what does not fit the lanes."""
 
+import pickle
+
 import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
 
 import servoctl as sv
-from servoctl.errors import SpecificationError
+from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.gallery import gallery
 from servoctl.methods import lanes
 from servoctl.model.validity import affirmed, affirmed_each
@@ -352,3 +354,71 @@ def test_derivations_are_affirmed_for_each_set_of_parameters_by_itself(gallery_m
     assert found.tolist() == [affirmed(model, column) for column in values.T]
     for column in values[:, found].T:
         assert holds(model.reduction, column)
+
+
+def signals_equal_runs(model, many, start, span, method=None, names=None):
+    """Every signal of a run, along the traces and at the end, is that of `simulate` for the case."""
+    columns = [name for name in model.numbers if name in many.study.columns]
+    for i, row in enumerate(many.study.rows()):
+        one = model.with_parameters(**{name: row[name] for name in columns})
+        x0 = start(i, one) if callable(start) else start
+        run = simulated(one, x0, span, method, t_eval=np.union1d(many.t, span[1])[:: 1 if span[1] > span[0] else -1])
+        assert tuple(many.trace) == run.names
+        for name in names or run.names:
+            within = {"rtol": 0, "atol": 1e-10 * np.abs(run[name]).max() + 1e-13, "err_msg": name}
+            np.testing.assert_allclose(many.trace[name][:, i], run[name][: len(many.t)], **within)
+            np.testing.assert_allclose(many[f"final {name}"][i], run[name][-1], **within)
+
+
+@pytest.mark.parametrize(
+    ("name", "span"),
+    [("overhead-crane", (0.0, 6.0)), ("crane-3d", (2.0, 0.0)), ("appell-hamel", (0.0, 1.0)), ("rolling-disc", (0.0, 0.5)),
+     ("reaction-wheels", (0.0, 0.3)), ("flexible-joint", (0.0, 1.0)), ("ball-on-turntable", (0.0, 0.5)),
+     ("constant-jerk", (0.0, 0.2))],
+)
+@pytest.mark.parametrize("count", [0, 5])
+def test_motions_have_the_signals_of_a_run(name, span, count, gallery_model):
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(t=span[0], **scene.start, guess=scene.guess)
+    parameters = {p: model.numbers[p] * np.array([0.9, 1.2]) for p in [*model.numbers][:1]}
+    many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(span[0], span[1] * 0.5, count))
+    signals_equal_runs(model, many, start, span)
+
+
+def test_signals_of_motions_by_themselves_and_of_errors():
+    """Plans with other knots have models of their own; where there is no motion there is no force."""
+    model = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    start = model.start(guess={"a": 0.9})
+    cases = {"T": [2.0, 1.0, 2.0, 2.0], "r": [1.0, 1.0, 0.5, 1.1], "m": [1.0, 2.0, 3.0, 4.0]}
+    many = sv.simulate_many(model, start, cases, (0.0, 1.5), t_eval=[0.8])
+    assert np.isnan(many.trace["F"][0]).tolist() == np.isnan(many["final F"]).tolist() == [False, False, True, False]
+    for i in (0, 1, 3):
+        case = {name: values[i] for name, values in cases.items()}
+        run = simulated(model.with_parameters(**case), start, (0.0, 1.5), t_eval=[0.8, 1.5])
+        np.testing.assert_allclose([many.trace["F"][0, i], many["final F"][i]], run["F"], rtol=1e-10)
+    again = pickle.loads(pickle.dumps(many))
+    np.testing.assert_allclose(again.trace["M"], many.trace["M"], rtol=1e-12)
+
+
+def test_forces_of_a_pendulum_against_their_closed_form(c_compiler):
+    """The force that holds the cart is m sin a (g cos a + a'^2), which its rates follow; more points than one call takes."""
+    model = pendulum()
+    t = np.linspace(0.0, 1.0, 201)
+    m = np.linspace(0.5, 2.0, 600)
+    many = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m}, (0.0, 1.0), sv.Taylor(jets=4), t_eval=t)
+    a, da, dda = (many.trace[name] for name in ("a", "da", "d2a"))
+    np.testing.assert_allclose(dda, -9.81 * np.sin(a), atol=1e-11)
+    np.testing.assert_allclose(many.trace["F"], m * (np.cos(a) * dda - np.sin(a) * da**2), atol=1e-10)
+    few = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m[:2]}, (0.0, 1.0), sv.Taylor(jets=4), t_eval=t[:3])
+    d3a = -9.81 * np.cos(few.trace["a"]) * few.trace["da"]
+    np.testing.assert_allclose(few.trace["d3a"], d3a, atol=1e-10)
+    rate = np.cos(few.trace["a"]) * d3a - 3 * np.sin(few.trace["a"]) * few.trace["da"] * few.trace["d2a"]
+    rate = m[:2] * (rate - np.cos(few.trace["a"]) * few.trace["da"] ** 3)
+    np.testing.assert_allclose(few.trace["dF"], rate, atol=1e-9)
+
+
+def test_unknown_signals_of_motions():
+    many = sv.simulate_many(pendulum(), {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1))
+    for read in (lambda: many.trace["force"], lambda: many["final force"], lambda: many["F"]):
+        with refused(NameUnknown):
+            read()

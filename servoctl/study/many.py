@@ -23,14 +23,19 @@ from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
 from servoctl.study.cases import FAILURE, as_columns
+from servoctl.study.signals import Signals
 from servoctl.study.table import Study, Traced, machine, table
+
+FINAL = "final "  # names of values at the end
 
 
 @dataclass(frozen=True, eq=False)
 class Motions(Traced):
     """The motions of many cases; made by `simulate_many`.
 
-    `motions["final theta"]` is a column of the table, (N,), `motions.trace["theta"]` is (K, N).
+    `motions["final theta"]` is a column of the table, (N,), `motions.trace["theta"]` is (K, N). Forces and outputs have
+    the names of a `Run`: `motions.trace["trolley"]` and `motions["final trolley"]` follow from the states when they are
+    read, as the signals of a `Run` do.
 
     Attributes
     ----------
@@ -39,9 +44,15 @@ class Motions(Traced):
         ended early are NaN; "error", "message" and "facts" have the reason.
     t : (K,) array
         Instants of the traces [s].
-    trace : dict of str to (K, N) array
-        The states at these.
+    trace : mapping of str to (K, N) array
+        The signals at these, NaN for motions that ended early.
     """
+
+    trace: Signals
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        signal = name.removeprefix(FINAL) if isinstance(name, str) else name
+        return self.study[name] if signal == name or name in self.study.columns else self.trace.final(signal)
 
     def __repr__(self):
         failed = int(np.sum(self.study["error"] != ""))
@@ -112,8 +123,9 @@ def simulate_many(
             motions.plans(span, times, threads, show)
         if not motions.interrupted:
             motions.one_by_one(span, method, times, show)
+    level = max(getattr(method, "jets", None) or 0, model.reduction.top)
     meta = {"t_span": list(span), "method": str(method), "interrupted": motions.interrupted}
-    return motions.result(times, meta)
+    return motions.result(span, times, level, meta)
 
 
 def _case_table(model, starts, parameters):
@@ -163,7 +175,8 @@ class _Many:
     def __init__(self, model, n, columns, starts, n_times):
         self.model, self.n, self.columns, self.starts, self.models = model, n, columns, starts, {}
         self.interrupted, n_x = False, len(model.state_names)
-        self.done, self.steps, self.errors = np.zeros(n, bool), np.full(n, np.nan), {}
+        self.done, self.steps, self.errors, self.runs = np.zeros(n, bool), np.full(n, np.nan), {}, {}
+        self.parameters = np.tile(model.parameters, (n, 1))
         self.final, self.samples = np.full((n, n_x), np.nan), np.full((n, n_times, n_x), np.nan)
 
     def model_of(self, i):
@@ -215,7 +228,7 @@ class _Many:
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
         t, span = span[0], (min(span), max(span))
         knots = self.model.require_smooth(span)
-        p, x = np.tile(self.model.parameters, (self.n, 1)), np.empty(self.final.shape)
+        p, x = self.parameters, np.empty(self.final.shape)
         ready = self._affirmed(p)
         try:
             ready &= self._started(t, x, p)
@@ -296,21 +309,26 @@ class _Many:
                 raise KeyboardInterrupt
             states = run.jets[: self.final.shape[1]].T
             self.final[i], self.steps[i] = states[-1], run.counters.get("steps", np.nan)
-            self.samples[i] = states[np.isin(run.t, times)]
+            self.samples[i], self.runs[i] = states[: len(times)], run
         self.done[i] = True
 
-    def result(self, times, meta):
-        """The table of the finished cases, and their traces."""
+    def result(self, span, times, level, meta):
+        """The table of the finished cases, and their signals."""
         which, names = np.flatnonzero(self.done), self.model.state_names
         if not len(which):
             raise KeyboardInterrupt
         columns = {"case": which}
         columns |= {name: np.asarray(column)[which] for name, column in self.columns.items()}
         columns |= {"steps": self.steps[which]}
-        columns |= {f"final {name}": self.final[which, j] for j, name in enumerate(names)}
+        columns |= {f"{FINAL}{name}": self.final[which, j] for j, name in enumerate(names)}
         for name in FAILURE:
             texts = [self.errors.get(i, {}).get(name, "") for i in which.tolist()] if self.errors else [""] * len(which)
             columns[name] = np.array(texts, dtype=str)
-        trace = dict(zip(names, self.samples[which].transpose(2, 1, 0), strict=True)) if len(times) else {}
+        samples, t = self.samples[which], _with_end(times, span)
+        if len(t) > len(times):
+            samples = np.append(samples, self.final[which, None], axis=1)
+        runs = {i: self.runs[k] for i, k in enumerate(which.tolist()) if k in self.runs}
+        states, p = samples.transpose(2, 1, 0), self.parameters[which].T
         meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
+        trace = Signals(self.model, t, len(times), states, p, level, runs)
         return Motions(Study("many", columns, meta), times, trace)
