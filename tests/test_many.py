@@ -1,6 +1,9 @@
 """Many motions at once: equal to `simulate` case by case, failures as rows, and what does not fit the lanes."""
 
 import pickle
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 
 import casadi as ca
 import numpy as np
@@ -8,7 +11,7 @@ import pytest
 from refusals import refused
 
 import servoctl as sv
-from servoctl.errors import NameUnknown, SpecificationError
+from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import gallery
 from servoctl.methods import lanes
 from servoctl.model.validity import affirmed, affirmed_each
@@ -61,7 +64,7 @@ def test_parameters_in_lanes_equal_simulate(span, gallery_model, monkeypatch, c_
     assert lanes.fits(model)
     with monkeypatch.context() as patch:
         in_lanes(patch)
-        many = sv.simulate_many(model, start, {"M": values}, span, t_eval=np.linspace(*span, 7), threads=2)
+        many = sv.simulate_many(model, start, {"M": values}, span, t_eval=np.linspace(*span, 7), executor=2)
     each_equals_simulate(model, many, start, span, sv.Taylor())
 
 
@@ -73,7 +76,7 @@ def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compi
         in_lanes(patch)
         many = sv.simulate_many(model, {"a": angles, "da": 0.1}, None, (0.0, 3.0), method)
         states = np.array([model.start(a=a, da=0.1).values for a in angles]).T
-        again = sv.simulate_many(model, states, None, (0.0, 3.0), method, threads=1)
+        again = sv.simulate_many(model, states, None, (0.0, 3.0), method, executor=1)
     assert np.array_equal(many["final a"], again["final a"])
     each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.1), (0.0, 3.0), method)
 
@@ -109,8 +112,8 @@ def test_starts_with_several_solutions_are_those_of_start(monkeypatch):
 def test_a_case_depends_neither_on_others_nor_on_threads(c_compiler):
     model = pendulum()
     angles = np.random.default_rng(SEED).uniform(-3, 3, 300)
-    all_ = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 1.0), threads=2)
-    some = sv.simulate_many(model, {"a": angles[100:103], "da": 0.0}, None, (0.0, 1.0), threads=1)
+    all_ = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 1.0), executor=2)
+    some = sv.simulate_many(model, {"a": angles[100:103], "da": 0.0}, None, (0.0, 1.0), executor=1)
     assert np.array_equal(all_["final a"][100:103], some["final a"])
 
 
@@ -196,7 +199,7 @@ def test_plans_over_parameters_equal_simulate(name, span, gallery_model, monkeyp
     assert lanes.plans_fit(model)
     with monkeypatch.context() as patch:
         in_lanes(patch)
-        many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(*span, 11), threads=2)
+        many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(*span, 11), executor=2)
         final = sv.simulate_many(model, start, parameters, span)
     each_equals_simulate(model, many, start, span, None)
     name = f"final {model.state_names[0]}"
@@ -288,7 +291,7 @@ def test_an_interrupt_ends_the_lanes_at_once(monkeypatch, c_compiler):
     angles = np.random.default_rng(SEED).uniform(-1, 1, 20_000)
     model = pendulum()
     start = model.start(a=0.1, da=0.0)
-    many = sv.simulate_many(model, start, {"k": 0.5 + 0.01 * angles}, (0.0, 30.0), threads=1)
+    many = sv.simulate_many(model, start, {"k": 0.5 + 0.01 * angles}, (0.0, 30.0), executor=1)
     assert many.study.meta["interrupted"] and 0 < len(many) < len(angles)
     assert np.isfinite(many["final a"]).all()
 
@@ -318,7 +321,8 @@ def test_without_a_compiler_the_results_are_the_same(monkeypatch, c_compiler):
         ({"starts": {"a": [0.1] * 3, "da": 0.0}, "parameters": {"k": [1.0, 2.0]}}, SpecificationError,
          {"lengths": [2, 3]}),
         ({"t_eval": [2.0]}, SpecificationError, {"t_eval": [2.0]}),
-        ({"threads": 0}, SpecificationError, {}),
+        ({"executor": 0}, SpecificationError, {}),
+        ({"executor": "two"}, SpecificationError, {}),
     ],
 )
 def test_bad_input(changed, kind, facts):
@@ -422,3 +426,69 @@ def test_unknown_signals_of_motions():
     for read in (lambda: many.trace["force"], lambda: many["final force"], lambda: many["F"]):
         with refused(NameUnknown):
             read()
+
+
+def same_motions(some, others):
+    """Bit for bit, where a NaN equals a NaN."""
+    assert list(some.study.columns) == list(others.study.columns)
+    for name in some.study.columns:
+        np.testing.assert_array_equal(some[name], others[name])
+    for name in some.trace:
+        np.testing.assert_array_equal(some.trace[name], others.trace[name])
+
+
+@pytest.mark.parametrize("pool", [ThreadPoolExecutor, partial(ProcessPoolExecutor, mp_context=get_context("spawn"))])
+def test_an_executor_computes_the_same_bits(pool, gallery_model, c_compiler):
+    """Lanes, plans of one model and of several, starts of all forms, and cases that fail."""
+    rod = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    angles = np.linspace(-2.0, 2.0, 4)
+    states = np.array([angles * 0, angles, angles * 0, angles])
+    free, wheel = pendulum(), gallery_model("appell-hamel")
+    scene = gallery["appell-hamel"]
+    kicked = pendulum(lambda a, t, p: p.k * ca.sin(t))
+    problems = [
+        (free, {"a": angles, "da": 0.1}, None, (0.0, 1.0)),
+        (free, states, {"k": 1.0 + angles}, (0.0, 1.0)),
+        (wheel, wheel.start(**scene.start, guess=scene.guess), {"M": [4.0, -5.0, 6.0]}, (0.0, 0.5)),
+        (rod, rod.start(guess={"a": 0.9}), {"T": [2.0, 1.0, 2.0], "r": [1.0, 1.0, 0.5]}, (0.0, 1.5)),
+        (kicked, {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1)),
+    ]
+    with pool(2) as executor:
+        for problem in problems:
+            options = {"t_eval": [problem[3][1] / 2], "progress": False}
+            same_motions(sv.simulate_many(*problem, **options, executor=executor), sv.simulate_many(*problem, **options))
+
+
+class Broken(Executor):
+    """It loses all calls but the first `good`, and has Ctrl-C meet the one with the index `interrupted`."""
+
+    def __init__(self, good, interrupted=None):
+        self.good, self.interrupted, self.calls = good, interrupted, 0
+
+    def submit(self, function, *arguments):
+        future, self.calls = Future(), self.calls + 1
+        if self.calls == self.interrupted:
+            raise KeyboardInterrupt
+        if self.calls > self.good:
+            future.set_exception(BrokenExecutor("a worker died"))
+        else:
+            future.set_result(function(*arguments))
+        return future
+
+
+def test_cases_that_an_executor_loses_are_rows():
+    problem = (pendulum(), {"a": [0.1, 0.2, 0.3], "da": 0.0}, None, (0.0, 0.1))
+    many = sv.simulate_many(*problem, executor=Broken(2))
+    assert many["error"].tolist() == ["", "", "BrokenExecutor"] and np.isnan(many["final F"][2])
+    assert many["final a"][:2].tolist() == sv.simulate_many(*problem)["final a"][:2].tolist()
+    with refused(ServoError, {"cases": 3, "error": "BrokenExecutor"}):
+        sv.simulate_many(*problem, executor=Broken(0))
+    with pytest.raises(KeyboardInterrupt):
+        sv.simulate_many(*problem, executor=Broken(3, interrupted=2))
+
+
+def test_an_executor_that_was_shut_down_is_refused():
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    with refused(ServoError, {"cases": 2}):
+        sv.simulate_many(pendulum(), {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1), executor=executor)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,9 +25,11 @@ from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
 from servoctl.study.cases import FAILURE, as_columns
 from servoctl.study.signals import Signals
+from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
 from servoctl.study.table import Study, Traced, machine, table
 
 FINAL = "final "  # names of values at the end
+PARTS = 16  # of the cases, which the workers of an executor share
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,7 @@ class Motions(Traced):
 def simulate_many(
     model: Model, starts: State | ArrayLike | Mapping[str, ArrayLike], parameters: Mapping[str, ArrayLike] | None,
     t_span: Sequence[float], method: Method | str | None = None, *, t_eval: ArrayLike | None = None,
-    threads: int | None = None, progress: bool | None = None,
+    executor: Executor | int | None = None, progress: bool | None = None,
 ) -> Motions:  # fmt: skip
     """Simulate the motion of a program for many starts and sets of parameters.
 
@@ -90,8 +93,9 @@ def simulate_many(
         Default: `Taylor()`; for a program that determines the motion completely "algebraic".
     t_eval : (K,) array, optional
         Times of the traces [s]; default: no traces.
-    threads : int, optional
-        Default: one per core.
+    executor : int or concurrent.futures.Executor, optional
+        The number of threads in this process, default: one per core; or an executor whose workers compute parts of the
+        cases, each on one thread: processes, loky, or Dask's `client.get_executor()`. It is not shut down.
     progress : bool, optional
         Show a progress bar; default: on a terminal, for work of more than a second.
 
@@ -106,10 +110,14 @@ def simulate_many(
     NameUnknown
         For a name that is no parameter.
     SpecificationError
-        If the cases form no table, or method or times are invalid.
+        If the cases form no table, or executor, method or times are invalid.
+    ServoError
+        If the workers of the executor died before they finished a case.
     """
     model = require_kind(Model, "model", model, "sv.derive(...)").including(names_of(starts))
-    span, threads = as_span(t_span), threads if threads is None else whole("threads", threads, least=1)
+    span = as_span(t_span)
+    if executor is not None and not isinstance(executor, Executor):
+        executor = whole("executor", executor, least=1)
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
     times = _trace_times(span, t_eval)
     motions = _Many(model, *_case_table(model, starts, parameters), len(times))
@@ -117,15 +125,21 @@ def simulate_many(
         def show(count):
             bar.update(count - bar.n)
 
-        if isinstance(method, Taylor) and fits(model):
-            motions.in_lanes(span, method, times, threads, show)
-        elif isinstance(method, Algebraic) and plans_fit(model):
-            motions.plans(span, times, threads, show)
-        if not motions.interrupted:
-            motions.one_by_one(span, method, times, show)
+        if isinstance(executor, Executor):
+            motions.on(executor, (span, method, times), show)
+        else:
+            motions.compute(span, method, times, executor, show)
     level = max(getattr(method, "jets", None) or 0, model.reduction.top)
     meta = {"t_span": list(span), "method": str(method), "interrupted": motions.interrupted}
     return motions.result(span, times, level, meta)
+
+
+def _computed(part, span, method, times):
+    """A part of the cases with its results, computed by a worker."""
+    leave_interrupts_to_parent()
+    part.compute(span, method, times, 1, lambda count: None)
+    part.models = {}
+    return part
 
 
 def _case_table(model, starts, parameters):
@@ -192,6 +206,52 @@ class _Many:
         if isinstance(self.starts, dict):
             return model.start(t=t, **{name: float(v[i] if v.ndim else v) for name, v in self.starts.items()})
         return self.starts[i] if np.ndim(self.starts) == 2 else self.starts
+
+    def compute(self, span, method, times, threads, progress):
+        """Compute all cases, as many as possible at once."""
+        if isinstance(method, Taylor) and fits(self.model):
+            self.in_lanes(span, method, times, threads, progress)
+        elif isinstance(method, Algebraic) and plans_fit(self.model):
+            self.plans(span, times, threads, progress)
+        if not self.interrupted:
+            self.one_by_one(span, method, times, progress)
+
+    def on(self, executor, arguments, progress):
+        """Compute parts of the cases on an executor; those that it does not finish are rows with its error."""
+        parts = dict(enumerate(np.array_split(np.arange(self.n), min(self.n, PARTS))))
+        calls = {k: (self.part(which), *arguments) for k, which in parts.items()}
+        unfinished = {}
+        try:
+            for k, part, error in on_executor(executor, _computed, calls):
+                which = parts[k]
+                if error is None:
+                    self._join(which, part)
+                else:
+                    unfinished |= dict.fromkeys(which.tolist(), lost(error))
+                progress(int(self.done.sum()))
+        except KeyboardInterrupt:
+            self.interrupted = True
+        if unfinished and not self.done.any():
+            raise died(next(iter(unfinished.values())), self.n)
+        self.errors |= unfinished
+        self.done[list(unfinished)] = True
+
+    def part(self, which):
+        """The problem of some cases."""
+        columns, starts = {name: [column[i] for i in which] for name, column in self.columns.items()}, self.starts
+        if isinstance(starts, dict):
+            starts = {name: values[which] if values.ndim else values for name, values in starts.items()}
+        elif np.ndim(starts) == 2:
+            starts = starts[which]
+        return _Many(self.model, len(which), columns, starts, self.samples.shape[1])
+
+    def _join(self, which, part):
+        """Take the results of a part."""
+        for name in ("done", "steps", "final", "samples", "parameters"):
+            getattr(self, name)[which] = getattr(part, name)
+        for name in ("errors", "runs"):
+            getattr(self, name).update((int(which[i]), value) for i, value in getattr(part, name).items())
+        self.interrupted |= part.interrupted
 
     def in_lanes(self, span, method, times, threads, progress):
         """Compute the cases that need nothing but steps."""
