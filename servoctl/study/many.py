@@ -29,7 +29,7 @@ from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_exec
 from servoctl.study.table import Study, Traced, machine, table
 
 FINAL = "final "  # names of values at the end
-PARTS = 16  # of the cases, which the workers of an executor share
+SHARES = 16  # of the cases, which the workers of an executor share
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def simulate_many(
     return motions.result(span, times, level, meta)
 
 
-def _computed(part, span, method, times):
+def _share_computed(part, span, method, times):
     """A part of the cases with its results, computed by a worker."""
     leave_interrupts_to_parent()
     part.compute(span, method, times, 1, lambda count: None)
@@ -218,11 +218,11 @@ class _Many:
 
     def on(self, executor, arguments, progress):
         """Compute parts of the cases on an executor; those that it does not finish are rows with its error."""
-        parts = dict(enumerate(np.array_split(np.arange(self.n), min(self.n, PARTS))))
+        parts = dict(enumerate(np.array_split(np.arange(self.n), min(self.n, SHARES))))
         calls = {k: (self.part(which), *arguments) for k, which in parts.items()}
         unfinished = {}
         try:
-            for k, part, error in on_executor(executor, _computed, calls):
+            for k, part, error in on_executor(executor, _share_computed, calls):
                 which = parts[k]
                 if error is None:
                     self._join(which, part)
