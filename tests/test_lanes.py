@@ -38,6 +38,7 @@ def on_grid(model, x):
     return model.grid(0.0, x, [0.0])
 
 
+UNREDUCED = np.concatenate([np.linspace(0.77, 0.8, 50), np.nextafter(0.785, [0, 1]), [0.785]])  # up to 0.785 and beyond
 BOTH = pytest.mark.parametrize(("loops", "evaluated"), [((), on_grid), (("law",), at_points)], ids=["lanes", "one"])
 
 
@@ -45,7 +46,7 @@ BOTH = pytest.mark.parametrize(("loops", "evaluated"), [((), on_grid), (("law",)
 def test_sine_and_cosine_are_within_two_units(loops, evaluated):
     rng = np.random.default_rng(2)
     turns = np.arange(-60, 61) * np.pi / 2
-    a = np.concatenate([rng.uniform(-10, 10, 200), rng.uniform(-1e5, 1e5, 100), turns, np.nextafter(turns, 99),
+    a = np.concatenate([rng.uniform(-10, 10, 200), rng.uniform(-1e5, 1e5, 100), UNREDUCED, -UNREDUCED, turns, np.nextafter(turns, 99),
                         63661 * np.pi / 2 + np.linspace(-1e-9, 1e-9, 5), [0.0, -0.0, TINY, -TINY, LAST_SMALL, 1e-5]])
     y = evaluated(compiled(function(ca.sin(X2[0]), ca.cos(X2[0])), "circular", loops=loops), np.vstack([a, a]))
     with mpmath.workdps(40):
