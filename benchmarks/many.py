@@ -84,7 +84,7 @@ def simulated(last, rtol):
 
     def call():
         method = sv.Taylor(last - 1, rtol=rtol, atol=rtol)
-        many = sv.simulate_many(model, start, masses(), (0.0, DURATION), method, threads=1)
+        many = sv.simulate_many(model, start, masses(), (0.0, DURATION), method, executor=1)
         return np.array([many[name] for name in columns])
 
     return call

@@ -1,12 +1,17 @@
 """Many motions at once: equal to `simulate` case by case, failures as rows, and what does not fit the lanes."""
 
+import pickle
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+
 import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
 
 import servoctl as sv
-from servoctl.errors import SpecificationError
+from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import gallery
 from servoctl.methods import lanes
 from servoctl.model.validity import affirmed, affirmed_each
@@ -59,7 +64,7 @@ def test_parameters_in_lanes_equal_simulate(span, gallery_model, monkeypatch, c_
     assert lanes.fits(model)
     with monkeypatch.context() as patch:
         in_lanes(patch)
-        many = sv.simulate_many(model, start, {"M": values}, span, t_eval=np.linspace(*span, 7), threads=2)
+        many = sv.simulate_many(model, start, {"M": values}, span, t_eval=np.linspace(*span, 7), executor=2)
     each_equals_simulate(model, many, start, span, sv.Taylor())
 
 
@@ -71,7 +76,7 @@ def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compi
         in_lanes(patch)
         many = sv.simulate_many(model, {"a": angles, "da": 0.1}, None, (0.0, 3.0), method)
         states = np.array([model.start(a=a, da=0.1).values for a in angles]).T
-        again = sv.simulate_many(model, states, None, (0.0, 3.0), method, threads=1)
+        again = sv.simulate_many(model, states, None, (0.0, 3.0), method, executor=1)
     assert np.array_equal(many["final a"], again["final a"])
     each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.1), (0.0, 3.0), method)
 
@@ -107,8 +112,8 @@ def test_starts_with_several_solutions_are_those_of_start(monkeypatch):
 def test_a_case_depends_neither_on_others_nor_on_threads(c_compiler):
     model = pendulum()
     angles = np.random.default_rng(SEED).uniform(-3, 3, 300)
-    all_ = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 1.0), threads=2)
-    some = sv.simulate_many(model, {"a": angles[100:103], "da": 0.0}, None, (0.0, 1.0), threads=1)
+    all_ = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 1.0), executor=2)
+    some = sv.simulate_many(model, {"a": angles[100:103], "da": 0.0}, None, (0.0, 1.0), executor=1)
     assert np.array_equal(all_["final a"][100:103], some["final a"])
 
 
@@ -194,7 +199,7 @@ def test_plans_over_parameters_equal_simulate(name, span, gallery_model, monkeyp
     assert lanes.plans_fit(model)
     with monkeypatch.context() as patch:
         in_lanes(patch)
-        many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(*span, 11), threads=2)
+        many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(*span, 11), executor=2)
         final = sv.simulate_many(model, start, parameters, span)
     each_equals_simulate(model, many, start, span, None)
     name = f"final {model.state_names[0]}"
@@ -286,7 +291,7 @@ def test_an_interrupt_ends_the_lanes_at_once(monkeypatch, c_compiler):
     angles = np.random.default_rng(SEED).uniform(-1, 1, 20_000)
     model = pendulum()
     start = model.start(a=0.1, da=0.0)
-    many = sv.simulate_many(model, start, {"k": 0.5 + 0.01 * angles}, (0.0, 30.0), threads=1)
+    many = sv.simulate_many(model, start, {"k": 0.5 + 0.01 * angles}, (0.0, 30.0), executor=1)
     assert many.study.meta["interrupted"] and 0 < len(many) < len(angles)
     assert np.isfinite(many["final a"]).all()
 
@@ -316,7 +321,8 @@ def test_without_a_compiler_the_results_are_the_same(monkeypatch, c_compiler):
         ({"starts": {"a": [0.1] * 3, "da": 0.0}, "parameters": {"k": [1.0, 2.0]}}, SpecificationError,
          {"lengths": [2, 3]}),
         ({"t_eval": [2.0]}, SpecificationError, {"t_eval": [2.0]}),
-        ({"threads": 0}, SpecificationError, {}),
+        ({"executor": 0}, SpecificationError, {}),
+        ({"executor": "two"}, SpecificationError, {}),
     ],
 )
 def test_bad_input(changed, kind, facts):
@@ -352,3 +358,137 @@ def test_derivations_are_affirmed_for_each_set_of_parameters_by_itself(gallery_m
     assert found.tolist() == [affirmed(model, column) for column in values.T]
     for column in values[:, found].T:
         assert holds(model.reduction, column)
+
+
+def signals_equal_runs(model, many, start, span, method=None, names=None):
+    """Every signal of a run, along the traces and at the end, is that of `simulate` for the case."""
+    columns = [name for name in model.numbers if name in many.study.columns]
+    for i, row in enumerate(many.study.rows()):
+        one = model.with_parameters(**{name: row[name] for name in columns})
+        x0 = start(i, one) if callable(start) else start
+        run = simulated(one, x0, span, method, t_eval=np.union1d(many.t, span[1])[:: 1 if span[1] > span[0] else -1])
+        assert tuple(many.trace) == run.names
+        for name in names or run.names:
+            within = {"rtol": 0, "atol": 1e-10 * np.abs(run[name]).max() + 1e-13, "err_msg": name}
+            np.testing.assert_allclose(many.trace[name][:, i], run[name][: len(many.t)], **within)
+            np.testing.assert_allclose(many[f"final {name}"][i], run[name][-1], **within)
+
+
+@pytest.mark.parametrize(
+    ("name", "span"),
+    [("overhead-crane", (0.0, 6.0)), ("crane-3d", (2.0, 0.0)), ("appell-hamel", (0.0, 1.0)), ("rolling-disc", (0.0, 0.5)),
+     ("reaction-wheels", (0.0, 0.3)), ("flexible-joint", (0.0, 1.0)), ("ball-on-turntable", (0.0, 0.5)),
+     ("constant-jerk", (0.0, 0.2))],
+)
+@pytest.mark.parametrize("count", [0, 5])
+def test_motions_have_the_signals_of_a_run(name, span, count, gallery_model):
+    scene, model = gallery[name], gallery_model(name)
+    start = model.start(t=span[0], **scene.start, guess=scene.guess)
+    parameters = {p: model.numbers[p] * np.array([0.9, 1.2]) for p in [*model.numbers][:1]}
+    many = sv.simulate_many(model, start, parameters, span, t_eval=np.linspace(span[0], span[1] * 0.5, count))
+    signals_equal_runs(model, many, start, span)
+
+
+def test_signals_of_motions_by_themselves_and_of_errors():
+    """Plans with other knots have models of their own; where there is no motion there is no force."""
+    model = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    start = model.start(guess={"a": 0.9})
+    cases = {"T": [2.0, 1.0, 2.0, 2.0], "r": [1.0, 1.0, 0.5, 1.1], "m": [1.0, 2.0, 3.0, 4.0]}
+    many = sv.simulate_many(model, start, cases, (0.0, 1.5), t_eval=[0.8])
+    assert np.isnan(many.trace["F"][0]).tolist() == np.isnan(many["final F"]).tolist() == [False, False, True, False]
+    for i in (0, 1, 3):
+        case = {name: values[i] for name, values in cases.items()}
+        run = simulated(model.with_parameters(**case), start, (0.0, 1.5), t_eval=[0.8, 1.5])
+        np.testing.assert_allclose([many.trace["F"][0, i], many["final F"][i]], run["F"], rtol=1e-10)
+    again = pickle.loads(pickle.dumps(many))
+    np.testing.assert_allclose(again.trace["M"], many.trace["M"], rtol=1e-12)
+
+
+def test_forces_of_a_pendulum_against_their_closed_form(c_compiler):
+    """The force that holds the cart is m sin a (g cos a + a'^2), which its rates follow; more points than one call takes."""
+    model = pendulum()
+    t = np.linspace(0.0, 1.0, 201)
+    m = np.linspace(0.5, 2.0, 600)
+    many = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m}, (0.0, 1.0), sv.Taylor(jets=4), t_eval=t)
+    a, da, dda = (many.trace[name] for name in ("a", "da", "d2a"))
+    np.testing.assert_allclose(dda, -9.81 * np.sin(a), atol=1e-11)
+    np.testing.assert_allclose(many.trace["F"], m * (np.cos(a) * dda - np.sin(a) * da**2), atol=1e-10)
+    few = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m[:2]}, (0.0, 1.0), sv.Taylor(jets=4), t_eval=t[:3])
+    d3a = -9.81 * np.cos(few.trace["a"]) * few.trace["da"]
+    np.testing.assert_allclose(few.trace["d3a"], d3a, atol=1e-10)
+    rate = np.cos(few.trace["a"]) * d3a - 3 * np.sin(few.trace["a"]) * few.trace["da"] * few.trace["d2a"]
+    rate = m[:2] * (rate - np.cos(few.trace["a"]) * few.trace["da"] ** 3)
+    np.testing.assert_allclose(few.trace["dF"], rate, atol=1e-9)
+
+
+def test_unknown_signals_of_motions():
+    many = sv.simulate_many(pendulum(), {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1))
+    for read in (lambda: many.trace["force"], lambda: many["final force"], lambda: many["F"]):
+        with refused(NameUnknown):
+            read()
+
+
+def same_motions(some, others):
+    """Bit for bit, where a NaN equals a NaN."""
+    assert list(some.study.columns) == list(others.study.columns)
+    for name in some.study.columns:
+        np.testing.assert_array_equal(some[name], others[name])
+    for name in some.trace:
+        np.testing.assert_array_equal(some.trace[name], others.trace[name])
+
+
+@pytest.mark.parametrize("pool", [ThreadPoolExecutor, partial(ProcessPoolExecutor, mp_context=get_context("spawn"))])
+def test_an_executor_computes_the_same_bits(pool, gallery_model, c_compiler):
+    """Lanes, plans of one model and of several, starts of all forms, and cases that fail."""
+    rod = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    angles = np.linspace(-2.0, 2.0, 4)
+    states = np.array([angles * 0, angles, angles * 0, angles])
+    free, wheel = pendulum(), gallery_model("appell-hamel")
+    scene = gallery["appell-hamel"]
+    kicked = pendulum(lambda a, t, p: p.k * ca.sin(t))
+    problems = [
+        (free, {"a": angles, "da": 0.1}, None, (0.0, 1.0)),
+        (free, states, {"k": 1.0 + angles}, (0.0, 1.0)),
+        (wheel, wheel.start(**scene.start, guess=scene.guess), {"M": [4.0, -5.0, 6.0]}, (0.0, 0.5)),
+        (rod, rod.start(guess={"a": 0.9}), {"T": [2.0, 1.0, 2.0], "r": [1.0, 1.0, 0.5]}, (0.0, 1.5)),
+        (kicked, {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1)),
+    ]
+    with pool(2) as executor:
+        for problem in problems:
+            options = {"t_eval": [problem[3][1] / 2], "progress": False}
+            same_motions(sv.simulate_many(*problem, **options, executor=executor), sv.simulate_many(*problem, **options))
+
+
+class Broken(Executor):
+    """It loses all calls but the first `good`, and has Ctrl-C meet the one with the index `interrupted`."""
+
+    def __init__(self, good, interrupted=None):
+        self.good, self.interrupted, self.calls = good, interrupted, 0
+
+    def submit(self, function, *arguments):
+        future, self.calls = Future(), self.calls + 1
+        if self.calls == self.interrupted:
+            raise KeyboardInterrupt
+        if self.calls > self.good:
+            future.set_exception(BrokenExecutor("a worker died"))
+        else:
+            future.set_result(function(*arguments))
+        return future
+
+
+def test_cases_that_an_executor_loses_are_rows():
+    problem = (pendulum(), {"a": [0.1, 0.2, 0.3], "da": 0.0}, None, (0.0, 0.1))
+    many = sv.simulate_many(*problem, executor=Broken(2))
+    assert many["error"].tolist() == ["", "", "BrokenExecutor"] and np.isnan(many["final F"][2])
+    assert many["final a"][:2].tolist() == sv.simulate_many(*problem)["final a"][:2].tolist()
+    with refused(ServoError, {"cases": 3, "error": "BrokenExecutor"}):
+        sv.simulate_many(*problem, executor=Broken(0))
+    with pytest.raises(KeyboardInterrupt):
+        sv.simulate_many(*problem, executor=Broken(3, interrupted=2))
+
+
+def test_an_executor_that_was_shut_down_is_refused():
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    with refused(ServoError, {"cases": 2}):
+        sv.simulate_many(pendulum(), {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1), executor=executor)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,14 +24,21 @@ from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, simulated
 from servoctl.study.cases import FAILURE, as_columns
+from servoctl.study.signals import Signals
+from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
 from servoctl.study.table import Study, Traced, machine, table
+
+FINAL = "final "  # names of values at the end
+SHARES = 16  # of the cases, which the workers of an executor share
 
 
 @dataclass(frozen=True, eq=False)
 class Motions(Traced):
     """The motions of many cases; made by `simulate_many`.
 
-    `motions["final theta"]` is a column of the table, (N,), `motions.trace["theta"]` is (K, N).
+    `motions["final theta"]` is a column of the table, (N,), `motions.trace["theta"]` is (K, N). Forces and outputs have
+    the names of a `Run`: `motions.trace["trolley"]` and `motions["final trolley"]` follow from the states when they are
+    read, as the signals of a `Run` do.
 
     Attributes
     ----------
@@ -39,9 +47,15 @@ class Motions(Traced):
         ended early are NaN; "error", "message" and "facts" have the reason.
     t : (K,) array
         Instants of the traces [s].
-    trace : dict of str to (K, N) array
-        The states at these.
+    trace : mapping of str to (K, N) array
+        The signals at these, NaN for motions that ended early.
     """
+
+    trace: Signals
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        signal = name.removeprefix(FINAL) if isinstance(name, str) else name
+        return self.study[name] if signal == name or name in self.study.columns else self.trace.final(signal)
 
     def __repr__(self):
         failed = int(np.sum(self.study["error"] != ""))
@@ -54,7 +68,7 @@ class Motions(Traced):
 def simulate_many(
     model: Model, starts: State | ArrayLike | Mapping[str, ArrayLike], parameters: Mapping[str, ArrayLike] | None,
     t_span: Sequence[float], method: Method | str | None = None, *, t_eval: ArrayLike | None = None,
-    threads: int | None = None, progress: bool | None = None,
+    executor: Executor | int | None = None, progress: bool | None = None,
 ) -> Motions:  # fmt: skip
     """Simulate the motion of a program for many starts and sets of parameters.
 
@@ -79,8 +93,9 @@ def simulate_many(
         Default: `Taylor()`; for a program that determines the motion completely "algebraic".
     t_eval : (K,) array, optional
         Times of the traces [s]; default: no traces.
-    threads : int, optional
-        Default: one per core.
+    executor : int or concurrent.futures.Executor, optional
+        The number of threads in this process, default: one per core; or an executor whose workers compute parts of the
+        cases, each on one thread: processes, loky, or Dask's `client.get_executor()`. It is not shut down.
     progress : bool, optional
         Show a progress bar; default: on a terminal, for work of more than a second.
 
@@ -95,10 +110,14 @@ def simulate_many(
     NameUnknown
         For a name that is no parameter.
     SpecificationError
-        If the cases form no table, or method or times are invalid.
+        If the cases form no table, or executor, method or times are invalid.
+    ServoError
+        If the workers of the executor died before they finished a case.
     """
     model = require_kind(Model, "model", model, "sv.derive(...)").including(names_of(starts))
-    span, threads = as_span(t_span), threads if threads is None else whole("threads", threads, least=1)
+    span = as_span(t_span)
+    if executor is not None and not isinstance(executor, Executor):
+        executor = whole("executor", executor, least=1)
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
     times = _trace_times(span, t_eval)
     motions = _Many(model, *_case_table(model, starts, parameters), len(times))
@@ -106,14 +125,21 @@ def simulate_many(
         def show(count):
             bar.update(count - bar.n)
 
-        if isinstance(method, Taylor) and fits(model):
-            motions.in_lanes(span, method, times, threads, show)
-        elif isinstance(method, Algebraic) and plans_fit(model):
-            motions.plans(span, times, threads, show)
-        if not motions.interrupted:
-            motions.one_by_one(span, method, times, show)
+        if isinstance(executor, Executor):
+            motions.on(executor, (span, method, times), show)
+        else:
+            motions.compute(span, method, times, executor, show)
+    level = max(getattr(method, "jets", None) or 0, model.reduction.top)
     meta = {"t_span": list(span), "method": str(method), "interrupted": motions.interrupted}
-    return motions.result(times, meta)
+    return motions.result(span, times, level, meta)
+
+
+def _share_computed(part, span, method, times):
+    """A part of the cases with its results, computed by a worker."""
+    leave_interrupts_to_parent()
+    part.compute(span, method, times, 1, lambda count: None)
+    part.models = {}
+    return part
 
 
 def _case_table(model, starts, parameters):
@@ -163,7 +189,8 @@ class _Many:
     def __init__(self, model, n, columns, starts, n_times):
         self.model, self.n, self.columns, self.starts, self.models = model, n, columns, starts, {}
         self.interrupted, n_x = False, len(model.state_names)
-        self.done, self.steps, self.errors = np.zeros(n, bool), np.full(n, np.nan), {}
+        self.done, self.steps, self.errors, self.runs = np.zeros(n, bool), np.full(n, np.nan), {}, {}
+        self.parameters = np.tile(model.parameters, (n, 1))
         self.final, self.samples = np.full((n, n_x), np.nan), np.full((n, n_times, n_x), np.nan)
 
     def model_of(self, i):
@@ -179,6 +206,52 @@ class _Many:
         if isinstance(self.starts, dict):
             return model.start(t=t, **{name: float(v[i] if v.ndim else v) for name, v in self.starts.items()})
         return self.starts[i] if np.ndim(self.starts) == 2 else self.starts
+
+    def compute(self, span, method, times, threads, progress):
+        """Compute all cases, as many as possible at once."""
+        if isinstance(method, Taylor) and fits(self.model):
+            self.in_lanes(span, method, times, threads, progress)
+        elif isinstance(method, Algebraic) and plans_fit(self.model):
+            self.plans(span, times, threads, progress)
+        if not self.interrupted:
+            self.one_by_one(span, method, times, progress)
+
+    def on(self, executor, arguments, progress):
+        """Compute parts of the cases on an executor; those that it does not finish are rows with its error."""
+        parts = dict(enumerate(np.array_split(np.arange(self.n), min(self.n, SHARES))))
+        calls = {k: (self.part(which), *arguments) for k, which in parts.items()}
+        unfinished = {}
+        try:
+            for k, part, error in on_executor(executor, _share_computed, calls):
+                which = parts[k]
+                if error is None:
+                    self._join(which, part)
+                else:
+                    unfinished |= dict.fromkeys(which.tolist(), lost(error))
+                progress(int(self.done.sum()))
+        except KeyboardInterrupt:
+            self.interrupted = True
+        if unfinished and not self.done.any():
+            raise died(next(iter(unfinished.values())), self.n)
+        self.errors |= unfinished
+        self.done[list(unfinished)] = True
+
+    def part(self, which):
+        """The problem of some cases."""
+        columns, starts = {name: [column[i] for i in which] for name, column in self.columns.items()}, self.starts
+        if isinstance(starts, dict):
+            starts = {name: values[which] if values.ndim else values for name, values in starts.items()}
+        elif np.ndim(starts) == 2:
+            starts = starts[which]
+        return _Many(self.model, len(which), columns, starts, self.samples.shape[1])
+
+    def _join(self, which, part):
+        """Take the results of a part."""
+        for name in ("done", "steps", "final", "samples", "parameters"):
+            getattr(self, name)[which] = getattr(part, name)
+        for name in ("errors", "runs"):
+            getattr(self, name).update((int(which[i]), value) for i, value in getattr(part, name).items())
+        self.interrupted |= part.interrupted
 
     def in_lanes(self, span, method, times, threads, progress):
         """Compute the cases that need nothing but steps."""
@@ -215,7 +288,7 @@ class _Many:
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
         t, span = span[0], (min(span), max(span))
         knots = self.model.require_smooth(span)
-        p, x = np.tile(self.model.parameters, (self.n, 1)), np.empty(self.final.shape)
+        p, x = self.parameters, np.empty(self.final.shape)
         ready = self._affirmed(p)
         try:
             ready &= self._started(t, x, p)
@@ -296,21 +369,26 @@ class _Many:
                 raise KeyboardInterrupt
             states = run.jets[: self.final.shape[1]].T
             self.final[i], self.steps[i] = states[-1], run.counters.get("steps", np.nan)
-            self.samples[i] = states[np.isin(run.t, times)]
+            self.samples[i], self.runs[i] = states[: len(times)], run
         self.done[i] = True
 
-    def result(self, times, meta):
-        """The table of the finished cases, and their traces."""
+    def result(self, span, times, level, meta):
+        """The table of the finished cases, and their signals."""
         which, names = np.flatnonzero(self.done), self.model.state_names
         if not len(which):
             raise KeyboardInterrupt
         columns = {"case": which}
         columns |= {name: np.asarray(column)[which] for name, column in self.columns.items()}
         columns |= {"steps": self.steps[which]}
-        columns |= {f"final {name}": self.final[which, j] for j, name in enumerate(names)}
+        columns |= {f"{FINAL}{name}": self.final[which, j] for j, name in enumerate(names)}
         for name in FAILURE:
             texts = [self.errors.get(i, {}).get(name, "") for i in which.tolist()] if self.errors else [""] * len(which)
             columns[name] = np.array(texts, dtype=str)
-        trace = dict(zip(names, self.samples[which].transpose(2, 1, 0), strict=True)) if len(times) else {}
+        samples, t = self.samples[which], _with_end(times, span)
+        if len(t) > len(times):
+            samples = np.append(samples, self.final[which, None], axis=1)
+        runs = {i: self.runs[k] for i, k in enumerate(which.tolist()) if k in self.runs}
+        states, p = samples.transpose(2, 1, 0), self.parameters[which].T
         meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
+        trace = Signals(self.model, t, len(times), states, p, level, runs)
         return Motions(Study("many", columns, meta), times, trace)

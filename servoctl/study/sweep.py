@@ -90,24 +90,24 @@ def sweep(
     name = name_of(case)
     key = identity(f"{_module_of(case)}.{name}", cases, seed)
     computed = _in_turn if executor is None else functools.partial(_on, executor)
-    lost, interrupted = {}, False
+    unfinished, interrupted = {}, False
     with Checkpoint(checkpoint, key, len(cases)) as disk:
         rows = {row["case"]: row for row in disk.rows if row["case"] in part}
         todo = [(i, cases[i]) for i in part if i not in rows]
         with progress_bar("sweep", progress, len(part), initial=len(rows), unit="case") as bar:
             try:
                 for i, row, finished in computed(case, todo, seed):
-                    (rows if finished else lost)[i] = row
+                    (rows if finished else unfinished)[i] = row
                     if finished:
                         disk.add(row)
                     bar.update()
             except KeyboardInterrupt:
                 interrupted = True
-    if lost and not rows:
-        raise _died(next(iter(lost.values())), len(part))
+    if unfinished and not rows:
+        raise died(next(iter(unfinished.values())), len(part))
     meta = {"case": name, "identity": key, "seed": seed, "count": len(cases), "shard": list(shard) if shard else None}
-    meta |= {"parameters": list(cases[0]), "lost": sorted(lost), "interrupted": interrupted, "machine": machine()}
-    columns = _columns(cases, rows | lost)
+    meta |= {"parameters": list(cases[0]), "lost": sorted(unfinished), "interrupted": interrupted, "machine": machine()}
+    columns = _columns(cases, rows | unfinished)
     return Study("sweep", columns, meta | {"message": _message(columns, meta, len(part))})
 
 
@@ -151,8 +151,7 @@ def merge(studies: Study | Iterable[Study]) -> Study:
 
 def evaluate(case, index, parameters, seed):
     """One row: case (the index), with the numbers of the case or its error, message and facts (JSON)."""
-    if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C: workers finish the case they are at
+    leave_interrupts_to_parent()
     random = {} if seed is None else {"rng": generator(seed, index)}
     try:
         numbers = _results(case(**parameters, **random), parameters)
@@ -161,6 +160,12 @@ def evaluate(case, index, parameters, seed):
     except BaseException as error:  # SystemExit and GeneratorExit, too: no case ends the sweep
         return {"case": index, "error": type(error).__name__, **_said(error)}
     return {"case": index, "numbers": numbers}
+
+
+def leave_interrupts_to_parent():
+    """Ignore Ctrl-C in a worker process: the parent handles it, and workers finish what they are at."""
+    if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _said(error):
@@ -233,28 +238,38 @@ def _in_turn(case, todo, seed):
 
 def _on(executor, case, todo, seed):
     """Rows (index, row, finished) as an executor finishes them; a case that it did not finish has its error."""
+    calls = {i: (case, i, parameters, seed) for i, parameters in todo}
+    for i, row, error in on_executor(executor, evaluate, calls):
+        yield i, row if error is None else {"case": i} | lost(error), error is None
+
+
+def on_executor(executor, function, calls):
+    """(key, result, error) of calls {key: arguments} as an executor finishes them; Ctrl-C cancels those not begun."""
     futures, unsent = {}, {}
     try:
-        for i, parameters in todo:
+        for key, arguments in calls.items():
             try:
-                futures[executor.submit(evaluate, case, i, parameters, seed)] = i
+                futures[executor.submit(function, *arguments)] = key
             except RuntimeError as error:  # the pool has died, or was shut down
-                unsent[i] = error
+                unsent[key] = error
         for future in as_completed(futures):
             try:
-                yield futures[future], future.result(), True
+                result = future.result()
             except Exception as error:
-                yield futures[future], _lost(futures[future], error), False
+                yield futures[future], None, error
+            else:
+                yield futures[future], result, None
     except (KeyboardInterrupt, GeneratorExit):
         for future in futures:
             future.cancel()
         raise
-    yield from ((i, _lost(i, error), False) for i, error in unsent.items())
+    yield from ((key, None, error) for key, error in unsent.items())
 
 
-def _lost(index, error):
+def lost(error):
+    """The columns `FAILURE` of a case that an executor did not finish."""
     message = f"The executor did not finish this case{f': {error}' if str(error) else '.'}"
-    return {"case": index, "error": type(error).__name__, "message": message, "facts": "{}"}
+    return {"error": type(error).__name__, "message": message, "facts": "{}"}
 
 
 @contextlib.contextmanager
@@ -371,7 +386,8 @@ def _message(columns, meta, count):
     return ", ".join(parts)
 
 
-def _died(row, count):
+def died(row, count):
+    """The error of an executor that finished none of `count` cases."""
     return ServoError(
         f"The executor finished none of {count} cases. {row['error']}: {row['message']}",
         "Each worker imports the module of the case and must have the memory that a case needs.",

@@ -1,0 +1,105 @@
+"""Signals of many motions by name, computed when they are read."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from servoctl.run import Run
+
+MOST_POINTS = 100_000  # of motions and instants at which signals are evaluated in one call
+
+
+class Signals(Mapping):
+    """Signals of N motions at K instants, (K, N) arrays by the names that a `Run` of one motion has.
+
+    Parameters
+    ----------
+    model : Model
+    t : (K,) or (K + 1,) array
+        The instants, then the end of the motions if that is none of them [s].
+    count : int
+        K
+    states : (n_x, K, N) or (n_x, K + 1, N) array
+        At these; NaN for motions that ended early.
+    parameters : (n_p, N) array
+        SI.
+    level : int
+        Highest order of the jets.
+    runs : dict of int to Run
+        Motions that have models of their own, by their index.
+    """
+
+    def __init__(self, model, t, count, states, parameters, level, runs):
+        self._model, self._t, self._count, self._runs = model, t, count, runs
+        self._states, self._parameters = states, parameters
+        self._jet_names = model.names_to(model.nq + level * model.n)
+        self._values = dict(zip(model.state_names, states, strict=True))
+
+    def __iter__(self):
+        return iter(dict.fromkeys([*self._jet_names, *self._model.signal_groups]))
+
+    def __len__(self):
+        return len(list(iter(self)))
+
+    def __getitem__(self, name):
+        return self._along(name)[: self._count]
+
+    def final(self, name):
+        """The values of a signal at the end of the motions, (N,)."""
+        return self._along(name)[-1]
+
+    def _along(self, name):
+        if name not in self._values:
+            self._values.update(self._computed(name))
+        return self._values[name]
+
+    def __contains__(self, name):
+        return name in list(iter(self))
+
+    def _computed(self, name):
+        """The signals (K, N) of a group by name, evaluated for all motions at once where their jets suffice."""
+        model = self._model
+        top, kind = model.jet_names[len(model.state_names) :], model.signal_groups.get(name)
+        names, f = model.signals(kind) if kind else (top, None)
+        at_once = name in top or f is not None and f.n_x <= len(model.jet_names)
+        each = np.arange(self._states.shape[2])
+        common = each[~np.isin(each, list(self._runs))] if at_once else each[:0]
+        values = np.full((len(names) if at_once else 1, *self._states.shape[1:]), np.nan)
+        for part in np.array_split(common, -(-len(common) * len(self._t) // MOST_POINTS)) if len(common) else ():
+            values[:, :, part] = self._evaluated(f, part)
+        values[:, np.isnan(self._states).any(axis=0)] = np.nan
+        names = names if at_once else (name,)
+        for i in np.setdiff1d(each, common).tolist():
+            run = self._run(i)
+            if run is not None:
+                values[:, :, i] = [run[name] for name in names]
+        return zip(names, values, strict=True)
+
+    def _evaluated(self, f, part):
+        """A function of the jets, or the highest of these, (n, K, N) for some motions."""
+        count = len(part)
+        t, p = np.repeat(self._t, count), np.tile(self._parameters[:, part], len(self._t))
+        jets = with_highest(self._model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
+        y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
+        return y.reshape(len(y), len(self._t), count)
+
+    def _run(self, i):
+        """The run of a motion; None if it ended early."""
+        states = self._states[:, :, i]
+        if i in self._runs or np.isnan(states).any():
+            return self._runs.get(i)
+        values = dict(zip(self._model.numbers, self._parameters[:, i].tolist(), strict=True))
+        model = self._model.with_parameters(**values)
+        jets = with_highest(model, self._t, states, model.parameters)
+        if len(self._jet_names) > len(jets):
+            jets = model.extended(self._t, jets, len(self._jet_names))
+        return Run(self._t, jets, self._jet_names, model)
+
+
+def with_highest(model, t, states, p):
+    """The jets (n_z, N) of states (n_x, N) at times (N,), with the derivatives that the model determines."""
+    n, n_x = model.n, len(states)
+    if not model.flat:
+        return np.concatenate([states, model.function("ode").grid(t, states, p)[n_x - n : n_x]])
+    first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq
+    return np.concatenate([states, model.function("path").grid(t, states[: model.nq], p)[first + n : first + 2 * n]])
