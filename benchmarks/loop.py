@@ -161,51 +161,48 @@ def mujoco_loop(compiled):
 
 
 def numba_loop():
-    """The equations by hand and the loop, compiled."""
+    """The equations by hand and the loop, compiled; in numbers, which takes less than half as long as in arrays."""
     import numba
 
     _, _, x0, u_ff, reference, K = loop()
     c_x, c_l = DAMPING["x"], DAMPING["l"]
-    x0, u_ff, reference, K = (np.ascontiguousarray(values) for values in (x0, u_ff.T, reference.T, K))
+    u_ff, reference, K = (np.ascontiguousarray(values) for values in (u_ff.T, reference.T, K))
 
     @numba.njit(fastmath=True, inline="always")
-    def rate(x, u, dx):
-        s, c = np.sin(x[2]), np.cos(x[2])
-        w = M_LOAD * (x[1] * x[5] * x[5] + G * c)
-        along, up, ms = u[0] - c_x * x[3] + s * w, u[1] - c_l * x[4] + w, M_LOAD * s
+    def rate(x, u):
+        _, l, theta, dx, dl, dtheta = x
+        s, c = np.sin(theta), np.cos(theta)
+        w = M_LOAD * (l * dtheta * dtheta + G * c)
+        along, up, ms = u[0] - c_x * dx + s * w, u[1] - c_l * dl + w, M_LOAD * s
         scale = 1 / (M_TROLLEY * (M_HOIST + M_LOAD) + ms * s * M_HOIST)
-        dx[:3] = x[3:]
-        dx[3] = (along * (M_HOIST + M_LOAD) - ms * up) * scale
-        dx[4] = ((M_TROLLEY + ms * s) * up - ms * along) * scale
-        dx[5] = -(dx[3] * c + 2 * x[4] * x[5] + G * s) / x[1]
+        ddx = (along * (M_HOIST + M_LOAD) - ms * up) * scale
+        ddl = ((M_TROLLEY + ms * s) * up - ms * along) * scale
+        return dx, dl, dtheta, ddx, ddl, -(ddx * c + 2 * dl * dtheta + G * s) / l
+
+    @numba.njit(fastmath=True, inline="always")
+    def moved(x, h, k):
+        return (x[0] + h * k[0], x[1] + h * k[1], x[2] + h * k[2], x[3] + h * k[3], x[4] + h * k[4], x[5] + h * k[5])
 
     @numba.njit(fastmath=True)
-    def run(x0, u_ff, reference, K, states, inputs):
-        h, x = 1 / RATE, x0.copy()
-        y, a, b, c, d = np.empty(6), np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    def run(x, u_ff, reference, K, states, inputs):
+        h = 1 / RATE
         for k in range(len(u_ff)):
-            u = inputs[k]
             for i in range(2):
-                u[i] = u_ff[k, i]
+                inputs[k, i] = u_ff[k, i]
                 for j in range(6):
-                    u[i] -= K[i, j] * (x[j] - reference[k, j])
-            states[k] = x
-            rate(x, u, a)
+                    inputs[k, i] -= K[i, j] * (x[j] - reference[k, j])
             for j in range(6):
-                y[j] = x[j] + h / 2 * a[j]
-            rate(y, u, b)
-            for j in range(6):
-                y[j] = x[j] + h / 2 * b[j]
-            rate(y, u, c)
-            for j in range(6):
-                y[j] = x[j] + h * c[j]
-            rate(y, u, d)
-            for j in range(6):
-                x[j] += h / 6 * (a[j] + 2 * (b[j] + c[j]) + d[j])
+                states[k, j] = x[j]
+            u = inputs[k, 0], inputs[k, 1]
+            a = rate(x, u)
+            b = rate(moved(x, h / 2, a), u)
+            c = rate(moved(x, h / 2, b), u)
+            d = rate(moved(x, h, c), u)
+            x = moved(moved(moved(moved(x, h / 6, a), h / 3, b), h / 3, c), h / 6, d)
 
     def call():
         states, inputs = np.empty((len(u_ff), 6)), np.empty((len(u_ff), 2))
-        run(x0, u_ff, reference, K, states, inputs)
+        run(tuple(x0), u_ff, reference, K, states, inputs)
         return states.T
 
     return call

@@ -10,7 +10,9 @@ import servoctl
 
 project, author, version = "servoctl", "servoctl contributors", servoctl.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
-html_theme, html_title, html_copy_source, html_show_copyright = "furo", "servoctl", False, False
+html_theme, html_title, html_copy_source = "furo", "servoctl", False
+html_show_copyright = False
+html_static_path, html_css_files = ["static"], ["site.css"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 autodoc_default_options = {"members": True, "member-order": "bysource"}

@@ -412,7 +412,9 @@ def _states(model, run):
 def _sizes(model, run):
     """Largest magnitude of each state along a run (n_x,), 1 where it stays at zero."""
     x = _states(model, run)
-    size = np.abs(x).max(axis=1, where=np.isfinite(x), initial=0.0)
+    size = np.maximum(x.max(axis=1, initial=0.0), -x.min(axis=1, initial=0.0))
+    if not np.isfinite(size).all():
+        size = np.abs(x).max(axis=1, where=np.isfinite(x), initial=0.0)
     return np.where(size > AT_ZERO * size.max(), size, 1.0)
 
 
@@ -690,7 +692,11 @@ def _may_be_largest(least, most):
 
 def _within(logs):
     """The largest of logs (n, n) between instants that are at most 0, 1, ..., n - 1 blocks apart."""
-    return np.maximum.accumulate([np.diag(logs, blocks).max() for blocks in range(len(logs))])
+    n = len(logs)
+    beside = np.full((n, 2 * n), -np.inf)
+    beside[:, :n] = logs
+    diagonals = np.lib.stride_tricks.as_strided(beside, (n, n), (beside.strides[0] + beside.itemsize, beside.itemsize))
+    return np.maximum.accumulate(diagonals.max(axis=0))
 
 
 def _unstable(corners, steps, ends, logs, scale):

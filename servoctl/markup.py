@@ -53,9 +53,9 @@ def lines_of(lines):
     return f"<table>{''.join(cells)}</table>"
 
 
-def digits(value):
-    """A number with six digits; a dash where there is none."""
-    return "–" if value is None else f"{value:.6g}"
+def digits(value, most=6):
+    """A number with six digits, or as many as given; a dash where there is none, and no zero with a sign."""
+    return "–" if value is None else f"{value + 0.0:.{most}g}"
 
 
 def _is_number(text):

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,6 +55,7 @@ from servoctl.run import SAME_TIME, Run
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
+_TOLD = WeakKeyDictionary()  # model -> what told that errors along its last motion do not grow
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
@@ -277,9 +279,7 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     """
     known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
     try:
-        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
-            return known
-        if by_series is not None and quiet_by_series(run.model, run, by_series):
+        if not run.success or _quiet(run, by_series):
             return known
         run = run if again is None else again()
         internal = internal_dynamics(run.model, run) if run.success else None
@@ -290,6 +290,21 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     if internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
     return replace(run, verdict=internal.facts(tolerance))
+
+
+def _quiet(run, by_series):
+    """Whether the bound of the growth, or the series, tell that it deserves no warning.
+
+    What told it of the last motion of a model comes first.
+    """
+    ways = {"bound": lambda: growth_bound(run.model, run) <= UNSTABLE}
+    if by_series is not None:
+        ways["series"] = lambda: quiet_by_series(run.model, run, by_series)
+    last = _TOLD.get(run.model)
+    told = next((way for way in sorted(ways, key=lambda way: way != last) if ways[way]()), None)
+    if told is not None and told != last:
+        _TOLD[run.model] = told
+    return told is not None
 
 
 def _verdict(run, _=None, *, tolerance):
@@ -430,7 +445,7 @@ def _run(model, motion, settings, start, t1):
 def _set_at_knots(t, jets, variants, knots):
     """Derivatives at knots by the equations at that instant: those of a series are of the side that it comes from."""
     knots = np.asarray(knots, dtype=float)
-    for first, end, model in variants:
+    for first, end, model in variants if len(knots) else ():
         near = np.abs(t[first:end, None] - knots) <= SAME_TIME * np.maximum(1.0, np.abs(knots))
         at = first + np.flatnonzero(near.any(axis=1))
         if len(at):

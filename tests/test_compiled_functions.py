@@ -15,6 +15,7 @@ from refusals import refused
 from servoctl.codegen import compiler, emit
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
+from servoctl.codegen.interpreted import MANY_POINTS, Interpreter
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.methods.runge_kutta import tableau
 
@@ -100,6 +101,35 @@ def test_every_operation_equals_casadi(monkeypatch, c_compiler):
         for row, expected, expression in zip(values, reference, expressions, strict=True):
             np.testing.assert_array_equal(np.isnan(row), np.isnan(expected), err_msg=str(expression))
             np.testing.assert_array_max_ulp(row, expected, maxulp=2)
+
+
+def test_operations_on_many_points_at_once_have_the_bits_of_single_points():
+    expressions, x = every_operation()
+    f, (a, b) = function(*expressions), X2.elements()
+    guarded = function(ca.if_else(a > 0, b, 3.0), ca.copysign(2.0, 2.0) * a, a - a, 0.0, -0.0, T, x=X2)
+    rng, n = np.random.default_rng(8), x.shape[1]
+    for g, p in itertools.product((f, guarded, random_function(900)), (np.array([1.5]), rng.normal(size=(1, n)))):
+        once, again, t = np.empty((g.numel_out(0), n)), np.empty((g.numel_out(0), n)), rng.normal(size=n)
+        evaluator = Interpreter(g)
+        for k in range(n):
+            once[:, k] = evaluator._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
+        while "_lanes" not in vars(evaluator):
+            evaluator.grid(t, x, p, again)
+        again[:] = np.inf
+        evaluator.grid(t, x, p, again)
+        np.testing.assert_array_equal(again, once)
+        zeros = once == 0
+        np.testing.assert_array_equal(np.signbit(again[zeros]), np.signbit(once[zeros]))
+
+
+def test_a_function_is_written_for_many_points_at_once_when_many_were_evaluated():
+    evaluator, y = Interpreter(random_function(50)), np.empty((21, MANY_POINTS // 2))
+    t, x, p = np.zeros(y.shape[1]), np.zeros((2, y.shape[1])), np.zeros(1)
+    made = []
+    for _ in range(3):
+        evaluator.grid(t, x, p, y)
+        made.append("_lanes" in vars(evaluator))
+    assert made == [False, True, True]
 
 
 def test_constants_are_exact(monkeypatch, c_compiler):

@@ -20,6 +20,7 @@ from servoctl import growth, simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 from servoctl.growth import growth_bound
 from servoctl.methods.flow import MOST_ALONG, deviations
+from servoctl.methods.taylor import last_index
 
 
 def internal(pair, span, start, **guess):
@@ -547,6 +548,34 @@ def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_m
     run = sv.simulate(model, start, span, t_eval=t_eval)
     assert growth_bound(model, run) > 10 or t_eval
     assert not calls and 30 < sv.internal_dynamics(model, run).growth < 52
+
+
+def test_what_told_that_growth_is_harmless_comes_first_next_time(gallery_model, monkeypatch):
+    """The bound is silent on 10 s of the wheel, the series on a run whose series are too coarse."""
+    model, tried = gallery_model("appell-hamel").with_parameters(I_x=0.1126, I_y=0.225), []
+    start = model.start(x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5)
+    for name in ("growth_bound", "quiet_by_series"):
+        real = getattr(simulation, name)
+        monkeypatch.setattr(simulation, name, lambda *a, name=name, real=real: tried.append(name) or real(*a))
+
+    def judged_by(end, method):
+        tried.clear()
+        verdict = sv.simulate(model, start, (0.0, end), method).internal["verdict"]
+        return verdict, tuple(tried)
+
+    bound, series = "growth_bound", "quiet_by_series"
+    assert judged_by(10.0, "Taylor") == ("neutral", (bound, series))
+    assert judged_by(10.0, "Taylor") == ("neutral", (series,))
+    assert judged_by(10.0, "DOP853") == ("neutral", (bound,))
+    assert judged_by(0.5, sv.Taylor(2, rtol=1e-6)) == ("neutral", (series, bound))
+    assert judged_by(0.5, "Taylor") == ("neutral", (bound,))
+
+
+def test_deviations_that_shrink_stay_in_the_tangent_space(gallery_model):
+    """Errors of differences along the constraints do not shrink: one-sided differences leave the tangent space here."""
+    model, scene = gallery_model("passive-arm"), gallery["passive-arm"]
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, "Taylor")
+    assert growth.quiet_by_series(model, run, last_index(model, sv.Taylor()))
 
 
 @pytest.mark.parametrize("length", [9.0, 20.0])

@@ -1,12 +1,14 @@
 """Sine and cosine of eight points at once, and of one, against extended precision; blocks of Newton's iteration."""
 
+import ctypes
+
 import casadi as ca
 import mpmath
 import numpy as np
 import pytest
 from test_compiled_functions import P1, X2, T, along, function, newton_model
 
-from servoctl.codegen import emit
+from servoctl.codegen import compiler, emit
 from servoctl.codegen import function as functions
 from servoctl.codegen.emit import SHARED, WIDE
 from servoctl.codegen.function import compiled
@@ -38,6 +40,7 @@ def on_grid(model, x):
     return model.grid(0.0, x, [0.0])
 
 
+UNREDUCED = np.concatenate([np.linspace(0.77, 0.8, 50), np.nextafter(0.785, [0, 1]), [0.785]])  # up to 0.785 and beyond
 BOTH = pytest.mark.parametrize(("loops", "evaluated"), [((), on_grid), (("law",), at_points)], ids=["lanes", "one"])
 
 
@@ -45,7 +48,7 @@ BOTH = pytest.mark.parametrize(("loops", "evaluated"), [((), on_grid), (("law",)
 def test_sine_and_cosine_are_within_two_units(loops, evaluated):
     rng = np.random.default_rng(2)
     turns = np.arange(-60, 61) * np.pi / 2
-    a = np.concatenate([rng.uniform(-10, 10, 200), rng.uniform(-1e5, 1e5, 100), turns, np.nextafter(turns, 99),
+    a = np.concatenate([rng.uniform(-10, 10, 200), rng.uniform(-1e5, 1e5, 100), UNREDUCED, -UNREDUCED, turns, np.nextafter(turns, 99),
                         63661 * np.pi / 2 + np.linspace(-1e-9, 1e-9, 5), [0.0, -0.0, TINY, -TINY, LAST_SMALL, 1e-5]])
     y = evaluated(compiled(function(ca.sin(X2[0]), ca.cos(X2[0])), "circular", loops=loops), np.vstack([a, a]))
     with mpmath.workdps(40):
@@ -83,6 +86,28 @@ def test_a_point_does_not_depend_on_its_place_in_a_grid():
     model = compiled(function(ca.sin(X2[0]) * ca.exp(X2[1])), "place")
     x = np.tile([[0.7], [0.2]], 21)
     assert len(set(model.grid(0.0, x, [0.0])[0].tolist())) == 1
+
+
+IN_USE = """
+#include <stdint.h>
+int64_t in_use(void (*grid)(int64_t, const double *, const double *, const double *, int64_t, double *), double *v)
+{
+    uint32_t low, high;
+    grid(8, v, v, v, 0, v + 64);
+    __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(1));
+    return low;
+}
+"""
+
+
+@pytest.mark.skipif("xgetbv1" not in compiler.features(), reason="the processor does not report registers in use")
+def test_a_grid_leaves_no_long_register_in_use():
+    model, values = compiled(function(X2[0] * X2[1], X2[0] + T), "registers"), np.ones(128)
+    model.grid(0.0, np.zeros((2, 8)), [0.0])
+    probe = compiler.library(IN_USE)
+    grid = ctypes.cast(model._lanes.native("grid"), ctypes.c_void_p)
+    upper_halves = 1 << 2 | 1 << 6  # of ymm and of zmm registers
+    assert not probe.in_use(grid, values.ctypes.data_as(ctypes.c_void_p)) & upper_halves
 
 
 def test_shared_divisors_are_inverted_once():

@@ -14,7 +14,7 @@ from scenes import CERTIFIED
 
 import servoctl as sv
 from servoctl.gallery import gallery, mass_on_car
-from servoctl.inversion.verdict import verdict
+from servoctl.inversion.verdict import eigenvalues, verdict
 from servoctl.methods.bounded import End
 
 # The internal dynamics of every scene, by hand:
@@ -294,6 +294,15 @@ STIFF = np.array([[0.0, 1.0], [-1e9, -1.0]])
 def test_eigenvalues_on_the_axis(A, size, count):
     """One on the axis within rounding, however rounding has split it; slow, stiff or slightly damped modes are not."""
     assert len(End(0.0, np.zeros(len(A)), A, size * np.ones(len(A))).on_axis) == count
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_rounding_of_zero_is_printed_as_zero(unit):
+    """Of two integrators, whose double eigenvalue rounding splits, and of an oscillator, whose frequency is none."""
+    A = np.array([[0.0, unit], [-1e-30 * unit, 0.0]])
+    assert eigenvalues(End(0.0, np.zeros(2), A, np.ones(2))) == "eigenvalues 0, 0 1/s"
+    slow = np.array([[0.0, 1.0], [-(1e-6**2), 0.0]])
+    assert eigenvalues(End(0.0, np.zeros(2), slow, np.ones(2))) == "eigenvalues 0 ± 1e-06i 1/s"
 
 
 def test_a_run_backwards_has_the_same_rests():

@@ -1,13 +1,15 @@
 """Consistent starts: held values, outputs and conditions; other states with the same held values; refusals."""
 
 import casadi as ca
+import closed_forms as cf
 import numpy as np
 import pytest
 from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import unknown
-from servoctl.gallery import gallery
+from servoctl.gallery import gallery, trailers
+from servoctl.model.start import State
 
 
 def two_link_arm():
@@ -399,3 +401,127 @@ def test_a_heading_that_is_given_at_rest_is_kept():
 def test_other_machines_at_rest_leave_nothing_open(name, gallery_model):
     scene = gallery[name]
     assert gallery_model(name).start(t=scene.t_span[0], guess=scene.guess, **scene.start).at_rest == ()
+
+
+# hidden constraints that divide by zero, and rates of residuals -------------------------------------------------------
+
+
+def car():
+    """A car without lean, 1.1 m long, by the speed v of its rear axle and its steering rate s."""
+    plain = sv.coordinates("x y psi delta")
+    x, y, psi, delta = plain
+    ahead, turn = ca.vertcat(ca.cos(psi), ca.sin(psi)), ca.tan(delta) / 1.1
+    q = plain.with_quasi_velocities("v s", [[ahead[0], 0], [ahead[1], 0], [turn, 0], [0, 1]])
+    v, s = q.w()
+    gibbs = sv.rigid_body(q, 80.0, (0, 0, 8.0), position=ca.vertcat(x, y), rates=(0, 0, v * turn))
+    gibbs += sv.rigid_body(q, 0.0, (0, 0, 0.2), rates=(0, 0, v * turn + s))
+    return sv.Mechanism(q, gibbs=gibbs, actuators={"drive": (1, 0), "steer": (0, 1)})
+
+
+def follower():
+    """A robot with one trailer, hitched at its axle, by the trailer's speed v and the robot's yaw rate r."""
+    plain = sv.coordinates("X Y a b")
+    X, Y, a, b = plain
+    turn = ca.tan(a - b)
+    q = plain.with_quasi_velocities("v r", [[ca.cos(b), 0], [ca.sin(b), 0], [0, 1], [turn, 0]])
+    v, r = q.w()
+    gibbs = sv.rigid_body(q, 10.0, (0, 0, 1.0), position=ca.vertcat(X, Y), rates=(0, 0, turn * v))
+    gibbs += sv.rigid_body(q, 5.0, (0, 0, 1.0), position=ca.vertcat(X + ca.cos(b), Y + ca.sin(b)), rates=(0, 0, r))
+    return sv.Mechanism(q, gibbs=gibbs, actuators={"push": (1 / ca.cos(a - b), 0), "turn": (0, 1)})
+
+
+def bent(q):
+    return sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=4.0, smoothness=6)
+
+
+def headed(mechanism, angle, target=bent, rate=False):
+    """A program of one direction and of the speed, 2 m/s; by the rate of the direction on request."""
+    q = mechanism.q
+    error = dict(zip(q.names, q, strict=True))[angle] - target(q)
+    return mechanism, sv.Program({"heading": q.dt(error) if rate else error, "speed": q.w()[0] - 2.0}, by="actuators")
+
+
+def curved():
+    """The trailers of the gallery by the curvature itself, in place of its rate."""
+    mechanism, _ = trailers()
+    q = mechanism.q
+    _, _, _, first, last = q
+    return mechanism, sv.Program({"heading": ca.tan(first - last) / 0.8 - bent(q) / 2, "speed": q.w()[0] - 1.0})
+
+
+UNDIVIDED = {  # the specification, a time at which its direction does not change, and whether it changes later
+    "a car": (lambda: headed(car(), "psi"), 0.0, True),
+    "a car at the end of its path": (lambda: headed(car(), "psi"), 4.0, False),
+    "a car between two bends": (lambda: headed(car(), "psi", lambda q: 0.3 * ca.sin(q.t)), np.pi / 2, True),
+    "a trailer": (lambda: headed(follower(), "b"), 0.0, True),
+    "two trailers": (curved, 0.0, True),
+}
+
+
+@pytest.mark.parametrize("name", UNDIVIDED)
+def test_a_hidden_constraint_that_divides_by_zero_is_refused_with_its_divisor(name):
+    """v tan δ = ψ' says nothing of v on a straight line, and the program of ψ and v leaves no other equation for it."""
+    build, t, changes = UNDIVIDED[name]
+    model = sv.derive(*build())
+    with refused(sv.SingularProgram, "divides by", "q.dt(heading, 1)", rows=["speed"], residuals=["heading"]) as caught:
+        model.start(t)
+    later = caught.value.details["nearest_time"]
+    assert (later is not None) == changes
+    if changes:
+        assert model.start(later).residual < 1e-10
+
+
+@pytest.mark.parametrize(("build", "angle"), [(car, "psi"), (follower, "b")])
+def test_the_rate_of_the_residual_leads_on_where_the_residual_itself_is_singular(build, angle):
+    model = sv.derive(*headed(build(), angle, rate=True))
+    run = sv.simulate(model, model.start(), (0.0, 5.0), t_eval=np.linspace(0.0, 5.0, 101))
+    assert run[angle] == pytest.approx(np.ravel(cf.rest_to_rest(run.t, 0, 0.0, 1.0, 4.0, 6)), abs=1e-7)
+    assert sv.verify(model, run).passed
+
+
+def by_rates(speed=0.0):
+    """The car along the parabola (s, s²/3), by the rates of its place."""
+    mechanism = car()
+    q = mechanism.q
+    x, y, _, _ = q
+    s = 3 * bent(q) + speed * q.t
+    return sv.derive(mechanism, sv.Program({"X": q.dt(x - s), "Y": q.dt(y - s**2 / 3)}))
+
+
+def test_a_car_by_rates_of_its_place_starts_from_rest_at_the_limit_of_its_motion():
+    start = by_rates().start()
+    assert set(start.at_rest) == {"psi", "delta"} and start.values[4:] == pytest.approx(0.0, abs=1e-12)
+    assert [start["psi"], start["delta"]] == pytest.approx([0.0, np.arctan(1.1 * 2 / 3)], abs=1e-4)
+
+
+def test_a_car_at_rest_with_given_directions_is_refused_as_it_stands_still():
+    """Its hidden constraints are 0/0 at rest."""
+    with refused(sv.SingularProgram, "stands still", "psi", "delta", t=0.0) as caught:
+        by_rates().start(psi=0.0, delta=0.0)
+    assert 0 < caught.value.details["nearest_time"] < 1.0
+
+
+def test_a_program_that_determines_velocities_but_not_all_coordinates_is_integrated():
+    model = by_rates(speed=1.0)
+    assert model.flat
+    run = sv.simulate(model, model.start(), (0.0, 3.0))
+    s = 3 * np.ravel(cf.rest_to_rest(run.t, 0, 0.0, 1.0, 4.0, 6)) + run.t
+    assert run["x"] == pytest.approx(s, abs=1e-7) and run["y"] == pytest.approx(s**2 / 3, abs=1e-7)
+    assert sv.verify(model, run).passed
+
+
+def test_a_search_that_ends_where_an_equation_has_no_gradient_says_so():
+    """max(x - 1, 0) = 1 has the solution x = 2, and below x = 1, where the search begins, no gradient."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
+    model = sv.derive(mechanism, sv.Program({"edge": ca.fmax(x - 1.0, 0.0) - 1.0}, by="ideal"), guess={"x": 3.0})
+    assert model.start(guess={"x": 3.0})["x"] == pytest.approx(2.0)
+    with refused(sv.InconsistentStart, "'edge' has no gradient", invariant="edge"):
+        model.start()
+
+
+def test_a_printed_state_has_zeros_for_rounding_and_held_values_as_they_are():
+    values, names = np.array([2.0, -1.8e-17, 1e-9, 1e-20]), ("x", "y", "z", "w")
+    assert "x = 2, y = 0, z = 1e-09, w = 1e-20" in repr(State(0.0, values, names, ("w",), (), 0.0))
+    assert "x = 2e-06, y = 0, z = 1e-15, w = 0" in repr(State(0.0, 1e-6 * values, names, (), (), 0.0))

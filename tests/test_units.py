@@ -14,6 +14,7 @@ from refusals import refused
 import servoctl as sv
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import Scene, gallery, overhead_crane, wheeled_robot
+from servoctl.markup import digits
 from servoctl.units import rate_unit, unit_of, unit_of_column
 
 ROBOTS = Path(__file__).parents[1] / "examples" / "robots"
@@ -237,7 +238,11 @@ def test_values_are_small_tables_in_a_notebook(plan, loop, table):
         assert shown.startswith("<p><b>") and shown.count("<table>") == shown.count("</table>") >= 1
         assert len(shown) < 8000
     assert "<td>trolley</td>" in plan._repr_html_() and "<td>N</td>" in plan._repr_html_()
-    assert f"<td class=n>{verification.numbers['acceleration']:.6g}</td>" in verification._repr_html_()
+    assert f"<td class=n>{verification.numbers['acceleration']:.2g}</td>" in verification._repr_html_()
+
+
+def test_a_zero_has_no_sign():
+    assert (digits(-0.0), digits(-1e-3), digits(1.23456e-9, 2), digits(None)) == ("0", "-0.001", "1.2e-09", "–")
 
 
 def test_what_a_notebook_shows_is_escaped():

@@ -13,6 +13,7 @@ from itertools import chain, count
 
 import casadi as ca
 
+from servoctl.codegen.chains import short_chains
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
 from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
 from servoctl.jets.lookup import lookup_at, lookups
@@ -82,6 +83,8 @@ class Dialect:
         Whether the operations are those of CasADi, one by one, without shared reciprocals.
     whole : bool
         Whether the text holds the numbers of large tables; otherwise they are set when its library is loaded.
+    chained : bool
+        Whether each evaluation waits for the one before: the statements of one chunk are those of `short_chains`.
     """
 
     number: str = "double"
@@ -92,6 +95,7 @@ class Dialect:
     linkage: str = ""
     exact: bool = False
     whole: bool = False
+    chained: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -128,11 +132,12 @@ class Dialect:
 SCALAR = Dialect(forms=_FORMS_OF_ONE)
 EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
+SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True)
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
 EXPORTED = replace(PORTABLE, whole=True)
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
 LANES = Dialect("W", "ALL({})", "w_", linkage="static ")
-LANES_INLINE = Dialect("W", "ALL({})", "w_", linkage="INLINE ")
+LANES_INLINE = Dialect("W", "ALL({})", "w_", linkage="INLINE ", chained=True)
 LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 
@@ -178,6 +183,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
         The same text for the same function, name and loops, in every process.
     """
     dialect = SCALAR_INLINE if INLINE_SINES.intersection(loops) else SCALAR
+    dialect = SCALAR_CHAINED if "closed" in loops else dialect
     scalar = {name: f} | ({} if project is None else {f"{name}_project": project})
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
     step = f.numel_in(1) if "newton" in loops else 0
@@ -271,7 +277,10 @@ def _prepared(f, dialect, suffix=""):
     statements, tables = tabulated(_statements(f, dialect, suffix))
     tables += [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
     header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
-    return statements if dialect.exact else _with_reciprocals(statements), [*header, *tables]
+    if not dialect.exact:
+        chained = dialect.chained and len(statements) <= CHUNK
+        statements = short_chains(statements) if chained else _with_reciprocals(statements)
+    return statements, [*header, *tables]
 
 
 def _statements(f, dialect, suffix=""):

@@ -19,7 +19,7 @@ from servoctl.codegen.native import Library, builtin
 from servoctl.codegen.tables import BOUND
 from servoctl.errors import SpecificationError, unknown
 
-GRID_POINTS = 2_500  # three longer grids take CasADi as long as writing and loading a library, 50 as compiling it
+GRID_POINTS = 2_500  # 20 longer grids take CasADi as long as writing and loading a library, 200 as compiling it
 CALLS = 10_000  # of one point: CasADi has taken as long as compiling takes then, where the function is long
 FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates

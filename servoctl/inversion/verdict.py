@@ -17,6 +17,7 @@ from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.reduction.structure import margins
 from servoctl.run import Run
+from servoctl.tolerances import NOISE
 
 FLAT, MINIMUM, MARGINAL, SINGULAR = "flat", "minimum phase", "marginal", "singular at rest"
 HYPERBOLIC_ZEROS, GROWS = "non-minimum phase (hyperbolic)", "non-minimum phase"
@@ -298,7 +299,8 @@ def _along(internal, why, facts):
 
 def eigenvalues(end):
     """The eigenvalues of a rest in words, at most four of them."""
-    upper = [(0.0 if v in end.on_axis else v.real, v.imag) for v in end.eigenvalues if v.imag >= 0]
-    values = [f"{real:.6g}" + (f" ± {imag:.6g}i" if imag > 0 else "") for real, imag in upper]
+    zero = NOISE * np.abs(end.A * end.size / end.size[:, None]).max(initial=0.0)
+    upper = [(0.0 if v in end.on_axis else v.real, v.imag) for v in end.eigenvalues if v.imag >= -zero]
+    values = [f"{real:.6g}" + (f" ± {imag:.6g}i" if imag > zero else "") for real, imag in upper]
     more = f" and {len(values) - 4} more" if len(values) > 4 else ""
     return f"eigenvalues {', '.join(values[:4])}{more} 1/s"

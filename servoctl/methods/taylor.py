@@ -426,6 +426,7 @@ class TaylorSteps(Stepping):
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if plain else self.nq * last) + self.n * last
+        self.integrated = self._integrated_levels()
 
     def _start(self, t, x, b):
         self.p = np.append(self.model.parameters, (t + b) / 2)
@@ -510,14 +511,18 @@ class TaylorSteps(Stepping):
         jets = log.jets(k, at, self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
         rtol, atol = self.tolerances
-        wrong, last = np.zeros(len(k), bool), self.f.sizes["last"]
-        for level, entries in self._integrated_levels().items():
-            raised = self.top - level
-            part = np.abs(h[k]) ** raised * (perm(last, level) / perm(last, self.top - 1))
+        off, h, last, wrong = np.abs(rates - jets[-n:]), np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
+        farthest, longest = off.max(axis=1), h.max()
+        for level, entries in self.integrated.items():
+            raised, part = self.top - level, perm(last, level) / perm(last, self.top - 1)
             state = log.states[: self.nq] if level == 0 else log.states[self.nq + (level - 1) * n :][:n]
-            sizes = np.maximum(np.abs(state).max(), np.abs(part * jets[-n:][entries]).max(axis=0))
-            error = (part * np.abs(rates - jets[-n:])[entries]).max(axis=0)
-            wrong |= (error > FAR_OFF * (atol + rtol * sizes)) & (np.abs(h[k]) > SMALLEST * span)
+            largest = np.abs(state).max()
+            if longest**raised * part * farthest[entries].max() <= FAR_OFF * (atol + rtol * largest):
+                continue
+            part = h[k] ** raised * part
+            sizes = np.maximum(largest, np.abs(part * jets[-n:][entries]).max(axis=0))
+            error = (part * off[entries]).max(axis=0)
+            wrong |= (error > FAR_OFF * (atol + rtol * sizes)) & (h[k] > SMALLEST * span)
         return int(k[wrong].min(initial=len(t) - 1))
 
     def _integrated_levels(self):

@@ -1,4 +1,4 @@
-"""Starts of machines that stand still: what their constraints determine in motion only, and the limit of the motion.
+"""Starts where a program is singular: machines that stand still, and hidden constraints that divide by zero.
 
 A rolling machine at rest satisfies its constraints with any heading. Where the motion that follows has a limit as it
 begins, its start is that limit.
@@ -6,12 +6,15 @@ begins, its start is that limit.
 
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, SingularProgram
+from servoctl.jets.branches import shown
 from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
 from servoctl.progress import stage
 from servoctl.reduction.ranks import equilibrate
+from servoctl.tolerances import RESOLVED
 
 STANDS = 1e-9  # velocities below this, relative to the coordinates' size, are rest
 MOVES = 1e-5  # velocities above this, likewise, leave six digits of directions that depend on their squares
@@ -78,8 +81,59 @@ def started(model, t, held, guess, hold):
             if state is None or not set(still.coordinates) <= set(chosen):
                 raise
     if state is None:
-        raise failure
+        if still is not None:
+            raise still.error(t, first_motion(model, t, chosen, still), chosen) from failure
+        raise division_by_zero(model, t, chosen) or failure
     return state
+
+
+def division_by_zero(model, t, chosen):
+    """The error of hidden constraints that divide by zero where the program holds at t [s]; None if none does.
+
+    That is the state nearest the chosen values (dict) that satisfies the constraints as they were written.
+    """
+    _, equations, _, x = _at_rest(model, t, chosen)
+    if not np.abs(equations.scaled(x)).max(initial=0.0) < TOLERANCE:
+        return None
+    r, hidden = model.reduction, {f"combination of {row.story}": row for row in model.reduction.hidden}
+    pivots = [(hidden[name], pivot) for name, pivot in r.pivots if name in hidden]
+    expressions, n_x = [pivot for _, pivot in pivots], len(model.state_names)
+    there = r.points.at([t], np.append(x[:n_x], np.zeros(model.n))[:, None], model.parameters)
+    usual, now = (np.abs(points.evaluate(expressions)[0]).max(axis=1, initial=0.0) for points in (r.points, there))
+    row, pivot = next((p for p, a, b in zip(pivots, now, usual, strict=True) if not a > RESOLVED * b), (None, None))
+    if row is None:
+        return None
+    later = _first_start(model, t, chosen)
+    raised = [name for name, k in row.uses.items() if k and name in r.original]
+    return SingularProgram(
+        f"At t = {t:.7g} s the hidden constraint {row.name!r} ({row.story}) divides by {shown(pivot)}, which is zero "
+        "where the program holds there.",
+        "A hidden constraint combines derivatives of residuals, and says nothing where its divisor is zero.",
+        nearest="" if later is None else f"t = {later:g} s, where it is not zero.",
+        do=f"Program {', '.join(f'q.dt({name}, 1)' for name in raised)} in place of the residual itself, and start "
+        f"where the residual is zero{'; or start later' if later is not None else ''}.",
+        t=float(t),
+        rows=[row.name],
+        divisor=shown(pivot),
+        residuals=raised,
+        nearest_time=later,
+    )
+
+
+def _first_start(model, t, chosen):
+    """A time [s] shortly after t at which the model has a start near the chosen values; None if none."""
+    for later in _later(model, t):
+        try:
+            return consistent(model, later, {}, chosen, None) and later
+        except InconsistentStart:
+            continue
+    return None
+
+
+def _later(model, t):
+    """Instants [s] after t, farther and farther, up to a quarter of the time to the next knot."""
+    length = min((knot - t for knot in model.knots if knot > t), default=1.0)
+    return [t + tau * length for tau in LATER]
 
 
 def _determined(model, state):
@@ -88,7 +142,7 @@ def _determined(model, state):
     if not np.all(np.isfinite(jacobian)):
         return False
     sizes = np.linalg.svd(equilibrate(jacobian)[0].astype(float), compute_uv=False)
-    return len(state.values) - np.sum(sizes > SPANNED) <= model.free
+    return np.sum(sizes > SPANNED) >= len(model.invariant_names())
 
 
 def _at_rest(model, t, chosen):
@@ -156,8 +210,7 @@ def _extrapolated(first, second, third):
 
 def first_motion(model, t, chosen, still):
     """A time [s] shortly after t at which the constraints determine a machine that stands still at t; None if none."""
-    length = min((knot - t for knot in model.knots if knot > t), default=1.0)
-    return next((t + tau * length for tau in LATER if _moves(model, t + tau * length, chosen, still)), None)
+    return next((later for later in _later(model, t) if _moves(model, later, chosen, still)), None)
 
 
 def _moves(model, t, guess, still):
@@ -170,6 +223,14 @@ def _moves(model, t, guess, still):
     except InconsistentStart:
         return False
     q = model.reduction.mechanism.q
-    measured = [not q.plain or name not in still.coordinates for name in q.names[: q.n]]
-    speed = np.abs(state.values[q.nq : q.nq + q.n][measured]).max(initial=0.0)
+    measured = [name not in still.coordinates for name in q.names]
+    speed = np.abs(_rates_of_coordinates(model, state)[measured]).max(initial=0.0)
     return bool(speed > MOVES * (1.0 + np.abs(state.values[: q.nq]).max())) and _determined(model, state)
+
+
+def _rates_of_coordinates(model, state):
+    """q' (nq,) at a state, also where velocities are others."""
+    q, parameters = model.reduction.mechanism.q, ca.vertcat(*model.reduction.mechanism.parameters.symbols)
+    arguments = q.t, q.jet(0), q.jet(1), parameters
+    rates = model.once("rates of coordinates", lambda: ca.Function("rates", arguments, [ca.vertcat(*q.d(1))]))
+    return np.ravel(rates(state.t, state.values[: q.nq], state.values[q.nq : q.nq + q.n], model.parameters))

@@ -30,6 +30,7 @@ SEARCH_STEPS = 20  # of Newton's method from each
 NEARER = 0.25  # of the way from one such state to another: a reference before it is clearly nearer the first
 DISTINCT = 1e-3  # difference of two such states, relative to their size
 SHOWN = 3  # values by which a printed state tells branches apart
+PRINTED_ZERO = 1e-14  # of the largest value: a smaller one that is not held is printed as zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class State(Value, Shown):
         return float(self.values[self.names.index(name)])
 
     def __repr__(self):
-        items = [f"{name} = {value:.6g}" for name, value in zip(self.names, self.values, strict=True)]
+        items = [f"{name} = {value:.6g}" for name, value in zip(self.names, self._without_rounding(), strict=True)]
         shown = ", ".join(items[:12]) + (f", ... ({len(items)} in all)" if len(items) > 12 else "")
         held, free, rest = (", ".join(names) or "nothing" for names in (self.held, self.free, self.at_rest))
         return (
@@ -80,6 +81,12 @@ class State(Value, Shown):
                if self.at_rest else "")
             + self._told_apart()
         )
+
+    def _without_rounding(self):
+        """The values, with zeros for those that Newton's method leaves as rounding of the largest, (n_x,)."""
+        size = np.abs(self.values)
+        shown = np.isin(self.names, self.held) | (size > PRINTED_ZERO * size.max(initial=0.0))
+        return np.where(shown, self.values, 0.0)
 
     def _told_apart(self):
         """The line of a printed state on its branches: the first values in which they differ."""
@@ -430,11 +437,22 @@ def _refuse(equations, aim, held, x):
             residual=float(largest),
             nearest_value=moved[change],
         )
-    largest, worst = max(zip(residuals, equations.rows, strict=True))
-    raise InconsistentStart(
-        f"The search for a consistent start ended with the residual {largest:.2e} of the invariant {worst!r}.",
+    raise _not_found(equations, x, residuals)
+
+
+def _not_found(equations, x, residuals):
+    """The error of a search that ended at jets (n_z,) with residuals (m,)."""
+    worst = int(np.argmax(np.nan_to_num(residuals, nan=np.inf)))
+    value, jacobian = (each[worst] for each in equations(x))
+    name, lacks = equations.rows[worst], "" if np.isfinite(value) else "value"
+    lacks = lacks or ("" if np.isfinite(jacobian).all() and jacobian.any() else "gradient")
+    end = f"where the invariant {name!r} has no {lacks}" if lacks else (
+        f"with the residual {residuals[worst]:.2e} of the invariant {name!r}"
+    )  # fmt: skip
+    return InconsistentStart(
+        f"The search for a consistent start ended {end}.",
         "A start satisfies every constraint and its time derivatives.",
         do="Pass a guess={...} nearer to the motion, or check that the program can hold at this time.",
-        invariant=worst,
-        residual=float(largest),
+        invariant=name,
+        residual=float(np.inf if lacks else residuals[worst]),
     )

@@ -14,7 +14,7 @@ from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, 
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
 from servoctl.tolerances import DEPENDENT, ENTRY
 
-TAKES_PART = 1e-12  # coefficient times the largest entry of a row: below this the row is no part of a combination
+TAKES_PART = 1e-12  # of the terms of a gradient: a row with a smaller multiple is no part of the combination
 SUPPORTS = 1e-13  # equilibrated coefficient, at any point, above which a row is part of a dependence
 BASIS_CUTOFF = 1e-12  # relative singular value of independent rows below which a direction is left out
 VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, below which the row is a square
@@ -443,12 +443,13 @@ def _eliminated(q, row, j, values, lower, points):
     if not lower:
         return None
     numbers, _ = leading(q, lower, points)
-    support = set()
+    support, size = set(), points.matrix(row.gradient(q, j))[1].max()
     for p in range(values.shape[1]):
         c, left = combination(numbers[:, :, p], values[:, p])
         if left > DEPENDENT:
             return None
-        support |= set(np.flatnonzero(np.abs(c * np.abs(numbers[:, :, p]).max(axis=1).astype(float)) > TAKES_PART))
+        parts = np.abs(c[:, None] * numbers[:, :, p])
+        support |= set(np.flatnonzero(parts.max(axis=1) > TAKES_PART * size))
     basis = []
     for a in sorted(support):
         if decide(numbers[[*basis, a], :, 0]).rank == len(basis) + 1:

@@ -21,7 +21,7 @@ PICTURES = {  # file: what it shows
 STYLE = """
 body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 img { max-width: 100%; } figure { margin: 1.2rem 0; } figcaption { color: #555; }
-table { border-collapse: collapse; margin: .6rem 0 1.2rem; display: block; overflow-x: auto; } th, td { padding: .2rem .9rem .2rem 0; text-align: left; }
+table { border-collapse: collapse; margin: .6rem 0 1.2rem; } th, td { padding: .2rem .9rem .2rem 0; text-align: left; }
 td.n, th.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 tr { border-bottom: 1px solid #ddd; }
 pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 13px; } .verdict { font-weight: 600; }
@@ -86,7 +86,8 @@ def _asked(facts, units):
     yield "start, SI", start
     yield "method", facts["method"] + (f", drift: {facts['drift']}" if facts["drift"] else "")
     yield "samples", str(facts["samples"])
-    yield "index", str(facts["structure"]["index"])
+    if facts["structure"]["index"] is not None:
+        yield "index", str(facts["structure"]["index"])
 
 
 def _ends(facts, units):

@@ -26,6 +26,7 @@ WORDS = {
     "loop limits": "inputs beyond their limits",
     "loop repeated": "all signals of the loop when it is run again",
 }
+RESIDUAL = "largest residual, of the constraint and of its derivatives"
 
 
 def within(value, limit):
@@ -82,7 +83,7 @@ class Verification(Shown):
     def rows(self):
         """For each number its name, value, limit, whether it is "within" or "beyond" that, and what it is: texts."""
         return [
-            (name, digits(value), digits(limit), within(value, limit), WORDS.get(name, ""))
+            (name, digits(value, 2), digits(limit, 2), within(value, limit), WORDS.get(name, RESIDUAL))
             for name, value in self.numbers.items()
             for limit in [self.limits.get(name)]
         ]

@@ -55,11 +55,11 @@ int64_t FN(closed)(Step *law, Loop *c)
             for (int64_t i = 0; i < c->n_u + c->n_z; i++) if (!isfinite(out[i])) { c->status = 2; return k; }
             const double *command = k < c->delay ? c->initial_input : out - c->delay * c->n_out;
             const double *before = k ? u - c->n_u : c->initial_input;
-            for (int64_t i = 0; i < c->n_u; i++) u[i] = limited(c, i, command[i], before[i]);
+            for (int64_t i = 0; i < c->n_u; i++) p[c->at_u + i] = u[i] = limited(c, i, command[i], before[i]);
             if (k == c->samples) { c->status = 0; return k + 1; }
             for (int64_t i = 0; i < c->n_z; i++) y[c->n_y + c->n_z + c->n_y + i] = out[c->n_u + i];
         }
-        for (int64_t i = 0; i < c->n_u; i++) p[c->at_u + i] = u[i];
+        for (int64_t i = 0; c->step && i < c->n_u; i++) p[c->at_u + i] = u[i];
         for (int64_t s = c->step; s < c->substeps; s++) {
             const int64_t step = k * c->substeps + s;
             for (int64_t i = 0; c->transport && i < c->n_u; i++) {

@@ -55,14 +55,15 @@ static void balance(int64_t n_x, const double *W, const Settings *settings, doub
     for (int64_t i = 0; i < n_x; i++) scale[i] = sqrt(square[i]);
 }
 
-/* ln of the norm of Y (F, F), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest eigenvalue F times
-   at most; of a norm below `least` fewer squarings do, as they bound it. work has 2 F^2 numbers. */
+/* ln of the norm of an upper triangular Y (F, F), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest
+   eigenvalue F times at most; of a norm below `least` fewer squarings do, as they bound it. work has 2 F^2 numbers. */
 static double log_norm(int64_t F, const double *Y, double squarings, double least, double *work)
 {
     double *G = work, *square = work + F * F, result = 0, part = 0.5;
-    for (int64_t i = 0; i < F; i++) for (int64_t j = 0; j < F; j++) {
-        G[i * F + j] = 0;
-        for (int64_t k = 0; k < F; k++) G[i * F + j] += Y[k * F + i] * Y[k * F + j];
+    for (int64_t i = 0; i < F; i++) for (int64_t j = i; j < F; j++) {
+        double sum = 0;
+        for (int64_t k = 0; k <= i; k++) sum += Y[k * F + i] * Y[k * F + j];
+        G[i * F + j] = G[j * F + i] = sum;
     }
     for (int squaring = 0; ; squaring++, part /= 2) {
         double trace = 0;

@@ -13,18 +13,19 @@ INLINE double s_select(int which, double a, double b) { return which ? a : b; }
 #define WHOLE int64_t
 #include "circular.h"
 
+#define EIGHTH 0.785 /* below pi/4: angles below it are as they were after a reduction, which is left out */
+
 static __attribute__((noinline, cold)) double s_far_sin(double a) { return sin(a); }
-INLINE double s_sin(double a)
+static __attribute__((noinline, cold)) double s_far_cos(double a) { return cos(a); }
+
+INLINE double s_circular(double a, int64_t turns)
 {
-    const double value = s_turned(a, 0);
-    return fabs(a) < FAR ? value : s_far_sin(a);
+    if (__builtin_expect(fabs(a) < EIGHTH, 1)) return s_of_reduced(a, 0, turns);
+    if (fabs(a) < FAR) return s_turned(a, turns);
+    return turns ? s_far_cos(a) : s_far_sin(a);
 }
 
-static __attribute__((noinline, cold)) double s_far_cos(double a) { return cos(a); }
-INLINE double s_cos(double a)
-{
-    const double value = s_turned(a, 1);
-    return fabs(a) < FAR ? value : s_far_cos(a);
-}
+INLINE double s_sin(double a) { return s_circular(a, 0); }
+INLINE double s_cos(double a) { return s_circular(a, 1); }
 
 #endif

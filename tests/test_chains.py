@@ -1,0 +1,153 @@
+"""Short chains of operations: the same values as the given statements, of which the last follows sooner."""
+
+import ctypes
+import re
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import servoctl as sv
+from servoctl import gallery
+from servoctl.codegen import emit
+from servoctl.codegen.chains import short_chains
+from servoctl.codegen.compiler import library
+
+T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 4), ca.SX.sym("p", 3)
+SINE, COSINE = ca.sin(X[0]), ca.cos(X[0])
+A, B, C = P.elements()
+
+
+def function(*outputs):
+    return ca.Function("f", [T, X, P], [ca.densify(ca.vertcat(*outputs))])
+
+
+def statements(f, chained=True):
+    dialect = emit.SCALAR_CHAINED if chained else emit.SCALAR_INLINE
+    return emit._prepared(f, dialect)[0]
+
+
+def compiled(f, chained=True):
+    """The function of (t, x, p) in C, as the loop of `sv.close` has it."""
+    dialect = emit.SCALAR_CHAINED if chained else emit.SCALAR_INLINE
+    call = library(emit.unit({"NAME": "f"}) + emit.function(f, "f", dialect), "-O1").f
+    call.restype = None
+
+    def evaluate(t, x, p):
+        y = np.empty(f.numel_out(0))
+        x, p = (np.array(v, dtype=float) for v in (x, p))
+        call(ctypes.c_double(t), *(ctypes.c_void_p(v.ctypes.data) for v in (x, p, y)))
+        return y
+
+    return evaluate
+
+
+def chain(statements):
+    """Operations in the longest chain from the entries of x whose rates are computed to an output."""
+    late = {"x" + target[1:] for target, _, operands in statements if isinstance(target, str) and type(operands[0]) is int}
+    length = dict.fromkeys(late, 0)
+    for target, _, operands in statements:
+        before = [length[v] for v in operands if v in length]
+        if before:
+            length[target] = max(before) + isinstance(target, int)
+    return max(n for target, n in length.items() if str(target).startswith("y"))
+
+
+EXPRESSIONS = {
+    "products of powers": X[0] * X[0] * A * X[3] * X[3] * (2 * B) * 0.5 * X[0] * X[1] * C * X[2] * X[2],
+    "quotients": (X[0] / A + X[1] / A - X[2] / (A * X[0])) / (1 / X[3]),
+    "signs": -(-X[0] - (A - (X[1] - 2 * (X[2] - 0.25 * X[3])))) - B,
+    "sums read twice": (X[0] + X[1] + A) * X[2] - (X[0] + X[1] + A) * (X[3] - X[0] - X[1]),
+    "one circle": A * X[3] * SINE**2 + B + A * X[3] * COSINE**2,
+    "a unit circle": SINE**2 + COSINE**2 + SINE * SINE * X[1] + COSINE * COSINE * X[1],
+    "circles of halves": 2 * A * SINE**2 + X[2] + 2 * A * COSINE**2 - 0.5 * COSINE**2 * B - 0.5 * SINE**2 * B,
+    "no circle: two angles": A * SINE**2 + A * ca.cos(X[1]) ** 2,
+    "no circle: a difference": A * SINE**2 - A * COSINE**2,
+    "no circle: two factors": A * SINE**2 + B * COSINE**2,
+    "no circle: one power": A * SINE + A * COSINE + A * SINE**3 + A * COSINE**3,
+    "no circle: two sines": A * SINE**2 + A * ca.sin(X[1]) ** 2,
+    "constants": 3 * (0.1 * (X[0] * 7)) / 0.3 + 0 * X[1] + 1 * X[2] - 1 * X[3] + ca.SX(2) ** 0.5,
+    "branches": ca.if_else(X[0] > A, X[1] * X[2] * X[3], ca.fabs(X[1]) / ca.sqrt(X[2] * X[2] + 1)) * A * X[1],
+    "many factors": ca.exp(X[1]) * ca.sumsqr(X) * np.prod([X[i % 4] + i for i in range(14)]),
+    "inputs": X[2],
+    "a number": ca.SX(3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EXPRESSIONS)
+@pytest.mark.usefixtures("c_compiler")
+def test_values_are_those_of_the_given_order(name):
+    f = function(EXPRESSIONS[name], X[3], EXPRESSIONS[name] * X[2] - A / X[3])
+    evaluate, rng = compiled(f), np.random.default_rng(len(name))
+    for _ in range(20):
+        x, p = rng.normal(size=4), rng.uniform(0.5, 2, 3)
+        exact = np.array(f(0.3, x, p)).ravel()
+        np.testing.assert_allclose(evaluate(0.3, x, p), exact, rtol=1e-14, atol=1e-13)
+
+
+@pytest.mark.parametrize("circles, name", [(True, name) for name in list(EXPRESSIONS)[4:7]]
+                         + [(False, name) for name in list(EXPRESSIONS)[7:12]])  # fmt: skip
+def test_a_circle_needs_no_sine(circles, name):
+    operations = {operation for _, operation, _ in statements(function(EXPRESSIONS[name]))}
+    assert (not operations & {ca.OP_SIN, ca.OP_COS}) == circles
+
+
+@pytest.mark.usefixtures("c_compiler")
+def test_what_is_not_finite_stays_so():
+    evaluate = compiled(function(X[0] * X[1] * X[2], X[0] / X[1], A * SINE**2 + A * COSINE**2 + X[0]))
+    assert np.isinf(evaluate(0, [1e200, 1e200, 1, 1], [1, 1, 1])[0])
+    for x in (np.nan, np.inf):
+        assert not np.isfinite(evaluate(0, [x, 1, 1, 1], [1, 1, 1])).any()
+
+
+@pytest.mark.parametrize("product", [X[3] * A * B * X[0] * C * X[3], A * B * X[0] * C * X[3] * X[3],
+                                     X[3] * (X[3] * (X[0] * (A * (B * C))))])  # fmt: skip
+def test_what_is_known_last_is_multiplied_and_added_last(product):
+    """v' = A B C q v² + A v + q + B: the square, its factor, and two additions follow v."""
+    f = function(X[2], X[3], 0, product + X[3] * A + X[0] + B)
+    assert chain(statements(f)) <= 4
+    f = function(X[2], X[3], 0, (((X[3] * A + X[0]) + B) + C) + X[1])
+    assert (chain(statements(f, chained=False)), chain(statements(f))) == (5, 2)
+
+
+SCENES = ("overhead_crane", "double_pendulum", "crane_3d", "furuta_pendulum", "rolling_disc", "slung_load", "cart_pole")
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.usefixtures("c_compiler")
+def test_rates_of_plants_have_shorter_chains_and_the_same_values(scene):
+    plant = sv.plant(getattr(gallery, scene)()[0])
+    f = plant.function("ode").expression
+    given, short = statements(f, chained=False), statements(f)
+    assert chain(short) < chain(given)
+    assert len(short) <= 1.2 * len(given)
+    evaluate, rng = compiled(f), np.random.default_rng(3)
+    for _ in range(20):
+        x, p = rng.normal(size=f.numel_in(1)), plant.p() * rng.uniform(0.5, 2, f.numel_in(2))
+        exact = np.array(f(0.3, x, p)).ravel()
+        np.testing.assert_allclose(evaluate(0.3, x, p), exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+def test_the_chain_of_the_crane_is_two_thirds():
+    f = sv.plant(gallery.overhead_crane()[0]).function("ode").expression
+    assert (chain(statements(f, chained=False)), chain(statements(f))) == (18, 12)
+
+
+def test_a_long_function_is_left_as_it_is():
+    f = function(sum(ca.sin(X[0] * k) * A * X[3] * k for k in range(emit.CHUNK)))
+    assert statements(f) == statements(f, chained=False)
+
+
+def test_the_text_of_a_loop_is_always_the_same():
+    f = sv.plant(gallery.crane_3d()[0]).function("ode").expression
+    assert emit.emit(f, "f", ("closed",)) == emit.emit(f, "f", ("closed",))
+    assert short_chains(statements(f, chained=False)) == short_chains(statements(f, chained=False))
+
+
+def test_vectors_of_a_block_compute_alike():
+    """Statements of several vectors alternate: those of one are those of the others, in the same order."""
+    f = sv.plant(gallery.crane_3d()[0]).function("ode").expression
+    text = emit.function_of_several(f, "rates", emit.LANES_INLINE, ("", "1"))
+    lines = [line.strip() for line in text[text.index("{\n") :].splitlines()[2:-1]]
+    one, other = lines[::2], [re.sub(r"\b([xpya])1(_?)(?=[\[\d])", r"\1\2", line) for line in lines[1::2]]
+    assert len(one) == len(statements(f)) and one == other
