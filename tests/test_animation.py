@@ -346,6 +346,26 @@ def test_poses_are_drawn_at_instants(crane, gallery_model):
     assert (np.diff(ax.get_yticks()) < 0).all() and ax.get_ylabel() == "t [s]"
 
 
+@pytest.mark.parametrize(("reach", "apart"), [(0.1, True), (8.0, False)])
+def test_poses_that_would_hide_each_other_are_side_by_side(reach, apart):
+    q = sv.coordinates("turn x", units="rad m")
+    turn, x = q
+    rim = [ca.vertcat(x + ca.cos(turn + a), ca.sin(turn + a), 0) for a in np.linspace(0.0, 2 * np.pi, 9)]
+    shapes = {"rim": rim, "spoke": [ca.vertcat(x, 0, 0), rim[0]]}
+    S = sv.particle(q, 1.0, x) + sv.rigid_body(q, 1.0, (0, 0, 1.0), position=ca.vertcat(x, 0, 0), rates=(0, 0, q.d(1)[0]))
+    mechanism = sv.Mechanism(q, gibbs=S, actuators={"M": turn, "F": x}, shapes=shapes)
+    program = sv.Program({"turns": turn - np.pi * q.t, "goes": x - reach * q.t}, by="actuators")
+    model = sv.derive(mechanism, program)
+    run = sv.simulate(model, model.start(), (0.0, 1.0))
+    ax = sv.plots.stroboscope(run, poses=5)
+    instants = [entry for entry in ax.texts if entry.get_text().endswith(" s")]
+    assert [entry.get_text() for entry in instants] == (["0 s", "0.25 s", "0.5 s", "0.75 s", "1 s"] if apart else [])
+    if apart:  # three in the first row, two below them
+        columns, rows = np.array([entry.get_position() for entry in instants]).T
+        assert np.ptp(rows[:3]) < 1e-12 > np.ptp(rows[3:]) and rows[3] < rows[0]
+        assert columns[:2] == pytest.approx(columns[3:]) and (np.diff(columns[:3]) > 1.5).all()
+
+
 def test_what_cannot_be_animated_is_refused(crane, loop, tmp_path):
     for fps in (0.5, 1000, np.nan, "fast"):
         with refused(SpecificationError):

@@ -26,6 +26,8 @@ BORDER = 0.06  # around the motion, of the picture's larger side
 ACROSS, UP = 6.4, 5.6  # inches, of the picture's plane
 TRIAD, ARROW = (0.32, 0.15), 0.33  # place and length of the directions of space [inches]
 SLIM = 0.12  # ratio of the sides below which poses would hide each other
+COVERED = 0.5  # part of two poses together that both cover, above which they hide each other
+GAP = 0.2  # between poses side by side, of the larger side of a pose
 SLIMMEST = 0.3  # least ratio of its sides
 VIEW = np.array([[0.866, -0.5, 0.0], [0.25, 0.433, 0.866]])  # parallel projection of space, from 30° above
 GREY, LINE, BODY, POINT = "#9A9A9A", "#404040", style.COLOURS[0], style.COLOURS[1]
@@ -218,7 +220,8 @@ def animate(run, fps=25, trail=None):
 def stroboscope(run, poses=9, trail=None, ax=None, title=""):
     """Draw the mechanism of a run at several instants, over the programmed path: an `animate` for print.
 
-    Poses of a motion along one horizontal line are drawn one below the other.
+    Poses of a motion along one horizontal line are drawn one below the other, and those of bodies that turn in place
+    side by side, as they would hide each other.
 
     Parameters
     ----------
@@ -245,6 +248,8 @@ def stroboscope(run, poses=9, trail=None, ax=None, title=""):
     poses = whole("poses", poses, 1)
     each = max(1, -(-PATH_POINTS // max(1, poses - 1)))
     picture = _pictured(run, _spread(run, (poses - 1) * each + 1), trail, 25.0, 1.0)
+    if poses > 1 and _in_place(picture, each):
+        return _side_by_side(picture, each, ax, text("title", title))
     rows = _along_a_line(picture) and poses > 1
     picture = _unrolled(picture) if rows else picture
     ax = _axes(picture, ax, text("title", title))
@@ -272,6 +277,38 @@ def _unrolled(picture):
     fall = np.zeros((2, 1)) - [[0.0], [1.0]] * (np.arange(len(picture.t)) * (high - low)[0] / (2 * len(picture.t)))
     shapes = {n: v + (fall if v.ndim == 2 else fall[:, np.newaxis]) for n, v in picture.shapes.items()}
     return replace(picture, shapes=shapes, trails={n: v + fall for n, v in picture.trails.items()}, programmed={})
+
+
+def _in_place(picture, each):
+    """Whether bodies in space, with no ground that they stand on, are drawn over each other at most of the poses."""
+    if not picture.space or any(_still(points, picture) for points in picture.shapes.values()):
+        return False
+    points = [np.reshape(v, (2, -1, len(picture.t)))[..., ::each] for v in picture.shapes.values()]
+    low, high = (ends(np.concatenate(points, axis=1), axis=1) for ends in (np.min, np.max))
+    first, second = np.triu_indices(low.shape[1], 1)
+    common = np.minimum(high[:, first], high[:, second]) - np.maximum(low[:, first], low[:, second])
+    both, sizes = np.clip(common, 0.0, None).prod(axis=0), (high - low).prod(axis=0)
+    return bool((both > COVERED * (sizes[first] + sizes[second] - both)).mean() > 0.5)
+
+
+def _side_by_side(picture, each, ax, title):
+    """The poses in rows from left to right, each with its instant and the trails up to it."""
+    low, high = _extent(picture)
+    at, count = slice(None, None, each), len(picture.t[::each])
+    columns = math.ceil(math.sqrt(count))
+    size = (high - low + GAP * (high - low).max())[:, np.newaxis]
+    place = size * [np.arange(count) % columns, -(np.arange(count) // columns)]
+    shapes = {n: v[..., at] + (place if v.ndim == 2 else place[:, np.newaxis]) for n, v in picture.shapes.items()}
+    parts = {f"{n} {k}": v[:, : k * each + 1] + place[:, [k]] for n, v in picture.trails.items() for k in range(count)}
+    ax = _axes(replace(picture, t=picture.t[at], shapes=shapes, trails=parts, programmed={}), ax, title)
+    for path in parts.values():
+        ax.plot(*path, color=POINT, linewidth=1.6, zorder=3)
+    for k, t in enumerate(picture.t[at]):
+        below = np.array([(low + high)[0] / 2, low[1] - GAP / 4 * (high - low).max()]) + place[:, k]
+        ax.text(*below, f"{t:.4g} s", ha="center", va="top", color=LINE)
+        for points in shapes.values():
+            _Moving(ax, points).show(k)
+    return ax
 
 
 def shows_mechanism(run) -> bool:

@@ -11,7 +11,8 @@ from servoctl.verification.result import CHECK
 NAME = "index.html"
 VERSIONS = ("", "version")
 PICTURES = {  # file: what it shows
-    "motion.png": "The mechanism at instants from the start (light) to the end (dark), over the programmed path.",
+    "motion.png": "The mechanism at instants from the start (light) to the end (dark), over the programmed path;"
+    " side by side where it turns in place.",
     "path.png": "The path.",
     "coordinates.png": "Coordinates.",
     "actuation.png": "Required actuation, with its extrema.",
@@ -21,7 +22,8 @@ PICTURES = {  # file: what it shows
 STYLE = """
 body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 img { max-width: 100%; } figure { margin: 1.2rem 0; } figcaption { color: #555; }
-table { border-collapse: collapse; margin: .6rem 0 1.2rem; } th, td { padding: .2rem .9rem .2rem 0; text-align: left; }
+table { border-collapse: collapse; margin: .6rem 0 1.2rem; display: block; overflow-x: auto; }
+th, td { padding: .2rem .9rem .2rem 0; text-align: left; }
 td.n, th.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 tr { border-bottom: 1px solid #ddd; }
 pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 13px; } .verdict { font-weight: 600; }
