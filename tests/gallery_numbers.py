@@ -6,6 +6,7 @@ from math import cos, pi, sin, sqrt
 import closed_forms
 import numpy as np
 from closed_forms import GRAVITY
+from scipy.special import ellipj
 
 import servoctl as sv
 from servoctl.gallery.six_axes import AXES, HOME
@@ -139,6 +140,20 @@ def reaction_wheels(run):
     return _largest(run, "s3"), 50.0 * 2 / 3 * 15 / 8 * (2 * pi / 3) / 20.0 / 0.1
 
 
+def free_rates(t):
+    """Rates of J = (30, 40, 50) without torque, by Jacobi's functions, of energy 4 J; (0.25, 0, 0.35) at the start."""
+    (a, b, c), twice, square = (30.0, 40.0, 50.0), 8.0, (30.0 * 0.25) ** 2 + (50.0 * 0.35) ** 2
+    near, far = twice * c - square, square - twice * a
+    sn, cn, dn, _ = ellipj(sqrt((c - b) * far / (a * b * c)) * t, (b - a) * near / ((c - b) * far))
+    return sqrt(near / (a * (c - a))) * cn, sqrt(near / (b * (c - b))) * sn, sqrt(far / (c * (c - a))) * dn
+
+
+def tumbling_satellite(run):
+    """With the torques -0.1 J ω the rates are exp(-0.1 t) times those of the free body at (1 - exp(-0.1 t))/0.1."""
+    slowed = np.exp(-0.1 * run.t[-1])
+    return run["w2"][-1], slowed * free_rates((1 - slowed) / 0.1)[1]
+
+
 def six_axis_arm(run):
     """The gradient of the potential energy of the six bodies, by differences."""
 
@@ -251,4 +266,6 @@ MORE = {
     "reaction-wheels": reaction_wheels,
     "six-axis-arm": six_axis_arm,
     "constant-jerk": constant_jerk,
+    "tumbling-satellite": tumbling_satellite,
+    "jerkless-trolley": lambda run: (_largest(run, "theta"), 2 * np.arctan(4.0 / GRAVITY)),
 }

@@ -86,6 +86,8 @@ GALLERY = {
     "reaction-wheels": ([0, 0, 0, 2, 2, 2], {"turn_rx": 2, "turn_ry": 2, "turn_rz": 2}),
     "rolling-disc": ([0, 1, 1, 2, 2, 2], {"height": 2, "rolling_x": 1, "rolling_y": 1}),
     "constant-jerk": ([3, 3], {"jerk": 0}),
+    "jerkless-trolley": ([3, 2], {"jerk": 0}),
+    "tumbling-satellite": ([1, 2, 2], {"energy": 1}),
     "trailers": ([0, 1], {"curvature": 2, "speed": 2}),
     "ball-on-turntable": ([0, 1, 1, 2, 2], {"rate": 2}),
     "rotary-crane": ([0] * 5, {"X": 4, "Y": 4, "Z": 4}),

@@ -1,4 +1,4 @@
-"""A satellite that three reaction wheels turn, and the attitude of a body by a unit quaternion."""
+"""Satellites whose attitude is a unit quaternion: one that reaction wheels turn, one whose tumbling is braked."""
 
 import casadi as ca
 
@@ -53,6 +53,48 @@ def reaction_wheels(turn=120.0, duration=20.0):
     )
     residuals = sv.programs.orientation("turn", axes, sv.rotations.turn(turned, AXIS))
     return mechanism, sv.Program(residuals, by="actuators")
+
+
+def tumbling_satellite(decay=0.1, weights="inertia"):
+    """Three torques take the energy out of a satellite's tumbling, by the generalised inverse of one row.
+
+    With the inertia's inverse as the weight they act along the angular momentum, whose direction in space does not
+    change; its magnitude falls by exp(-decay t). The body goes through the attitudes of its free motion, and arrives
+    at time t where that is at (1 - exp(-decay t))/decay. The plain pseudoinverse acts along the rates instead.
+
+    Parameters
+    ----------
+    decay : float
+        Half the rate of the energy's decay [1/s].
+    weights : "inertia" or None
+        Of the torques; None is the pseudoinverse.
+
+    Returns
+    -------
+    Mechanism, Program
+        Realised by the actuators "torque1", "torque2", "torque3" [N m]; of order 1, quadratic in the velocities.
+    """
+    p = sv.parameters(J1=30.0, J2=40.0, J3=50.0, E=4.0, decay=decay)  # kg m^2, J at the start, 1/s
+    plain = sv.coordinates("e0 e1 e2 e3", units="1 1 1 1")  # quaternion of the body
+    e = ca.vertcat(*plain)
+    q = plain.with_quasi_velocities("w1 w2 w3", quaternion_rates(e), invariants={"unit": ca.sumsqr(e) - 1})
+    w, dw = ca.vertcat(*q.w()), ca.vertcat(*q.w(1))
+    J = ca.vertcat(p.J1, p.J2, p.J3)
+    momentum = J * w  # N m s, along the body's axes
+    energy = ca.dot(w, momentum) / 2
+    axes = attitude(e)
+    outputs = {f"momentum_{name}": entry for name, entry in zip("xyz", ca.vertsplit(axes @ momentum), strict=True)}
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=ca.dot(dw, J * dw) / 2 + ca.dot(dw, ca.cross(w, momentum)),  # (3.11)
+        actuators={f"torque{i + 1}": ca.SX.eye(3)[:, i] for i in range(3)},
+        outputs=outputs | {"energy": energy},
+        shapes={f"axis {i + 1}": [(0, 0, 0), 0.6 * axle] for i, axle in enumerate(ca.horzsplit(axes))}
+        | {"pointer": [1.2 * axes[:, 2]]},
+        units=dict.fromkeys(q.velocity_names, "rad/s") | dict.fromkeys(outputs, "N m s") | {"energy": "J"},
+        parameters=p,
+    )
+    return mechanism, sv.Program({"energy": energy - p.E * ca.exp(-2 * p.decay * q.t)}, weights=weights)
 
 
 def quaternion_rates(e):

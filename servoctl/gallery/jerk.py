@@ -1,4 +1,4 @@
-"""A particle whose jerk keeps its magnitude: a program of order 3, quadratic in the highest derivatives."""
+"""Programs on the jerk: of a particle, whose magnitude is constant, and of a trolley, which has none."""
 
 import casadi as ca
 
@@ -32,3 +32,35 @@ def constant_jerk(magnitude=2.0):
         parameters=p,
     )
     return mechanism, sv.Program(sv.programs.jerk_norm("jerk", q, place, p.J), by="ideal")
+
+
+def jerkless_trolley():
+    """A trolley with a swinging rod has no jerk: an ideal reaction, a force on the trolley, keeps its acceleration.
+
+    Seen from the trolley, the rod swings in the constant gravity g - a: from rest in the vertical it comes to
+    2 arctan(a/g), and back.
+
+    Returns
+    -------
+    Mechanism, Program
+        Ideal realisation, of order 3.
+    """
+    p = sv.parameters(M=3.0, m=2.0, l=1.0, g=9.81)  # kg, kg, m, m/s^2
+    q = sv.coordinates("x theta", units="m rad")  # the rod hangs at zero
+    x, theta = q
+    direction = ca.vertcat(-ca.sin(theta), -ca.cos(theta))
+    centre = ca.vertcat(x, 0) + p.l / 2 * direction
+    S = sv.particle(q, p.M, x)
+    S += sv.rigid_body(q, p.m, (0, 0, p.m * p.l**2 / 12), position=centre, rates=(0, 0, -q.d(1)[1]))
+    mechanism = sv.Mechanism(
+        q,
+        gibbs=S,
+        potential=p.m * p.g * centre[1],
+        shapes={
+            "rail": [(-0.5, 0), (12, 0)],
+            "trolley": sv.shapes.box((x, 0), 0.5, 0.25),
+            "rod": [(x, 0), ca.vertcat(x, 0) + p.l * direction],
+        },
+        parameters=p,
+    )
+    return mechanism, sv.Program({"jerk": q.d(3)[0]}, by="ideal")
