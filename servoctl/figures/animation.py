@@ -25,9 +25,10 @@ STILL = 1e-9  # change of a shape over the motion below which it is the ground, 
 BORDER = 0.06  # around the motion, of the picture's larger side
 ACROSS, UP = 6.4, 5.6  # inches, of the picture's plane
 TRIAD, ARROW = (0.32, 0.15), 0.33  # place and length of the directions of space [inches]
+ASIDE = 0.75  # width of the directions of space, which poses side by side leave free [inches]
 SLIM = 0.12  # ratio of the sides below which poses would hide each other
 COVERED = 0.5  # part of two poses together that both cover, above which they hide each other
-GAP = 0.2  # between poses side by side, of the larger side of a pose
+GAP = 0.35  # between poses side by side, of the larger side of a pose
 SLIMMEST = 0.3  # least ratio of its sides
 VIEW = np.array([[0.866, -0.5, 0.0], [0.25, 0.433, 0.866]])  # parallel projection of space, from 30° above
 GREY, LINE, BODY, POINT = "#9A9A9A", "#404040", style.COLOURS[0], style.COLOURS[1]
@@ -280,11 +281,14 @@ def _unrolled(picture):
 
 
 def _in_place(picture, each):
-    """Whether bodies in space, with no ground that they stand on, are drawn over each other at most of the poses."""
-    if not picture.space or any(_still(points, picture) for points in picture.shapes.values()):
-        return False
+    """Whether bodies in space, held at one point at most, are drawn over each other at most of the poses."""
     points = [np.reshape(v, (2, -1, len(picture.t)))[..., ::each] for v in picture.shapes.values()]
-    low, high = (ends(np.concatenate(points, axis=1), axis=1) for ends in (np.min, np.max))
+    points = np.concatenate(points, axis=1)
+    low, high = points.min(axis=1), points.max(axis=1)
+    small = STILL * (high - low).max()
+    held = points[:, np.ptp(points, axis=2).max(axis=0) <= small, 0]
+    if not picture.space or (held.max(axis=1, initial=-np.inf) - held.min(axis=1, initial=np.inf)).max() > small:
+        return False
     first, second = np.triu_indices(low.shape[1], 1)
     common = np.minimum(high[:, first], high[:, second]) - np.maximum(low[:, first], low[:, second])
     both, sizes = np.clip(common, 0.0, None).prod(axis=0), (high - low).prod(axis=0)
@@ -295,12 +299,14 @@ def _side_by_side(picture, each, ax, title):
     """The poses in rows from left to right, each with its instant and the trails up to it."""
     low, high = _extent(picture)
     at, count = slice(None, None, each), len(picture.t[::each])
-    columns = math.ceil(math.sqrt(count))
+    columns = math.ceil(count / math.isqrt(count))
     size = (high - low + GAP * (high - low).max())[:, np.newaxis]
     place = size * [np.arange(count) % columns, -(np.arange(count) // columns)]
     shapes = {n: v[..., at] + (place if v.ndim == 2 else place[:, np.newaxis]) for n, v in picture.shapes.items()}
     parts = {f"{n} {k}": v[:, : k * each + 1] + place[:, [k]] for n, v in picture.trails.items() for k in range(count)}
     ax = _axes(replace(picture, t=picture.t[at], shapes=shapes, trails=parts, programmed={}), ax, title)
+    (left, right), inches = ax.get_xlim(), ax.figure.get_size_inches()[0]
+    ax.set_xlim(left - (right - left) * ASIDE / max(inches - ASIDE, ASIDE), right)
     for path in parts.values():
         ax.plot(*path, color=POINT, linewidth=1.6, zorder=3)
     for k, t in enumerate(picture.t[at]):

@@ -57,7 +57,7 @@ def jerkless_trolley():
         gibbs=S,
         potential=p.m * p.g * centre[1],
         shapes={
-            "rail": [(-0.5, 0), (12, 0)],
+            "rail": [(-0.5, 0), (13, 0)],
             "trolley": sv.shapes.box((x, 0), 0.5, 0.25),
             "rod": [(x, 0), ca.vertcat(x, 0) + p.l * direction],
         },
