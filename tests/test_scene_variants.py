@@ -8,17 +8,18 @@ from math import cos, sin, sqrt, tan
 import casadi as ca
 import numpy as np
 import pytest
-from gallery_numbers import wrenches
+from gallery_numbers import free_rates, wrenches
 from refusals import refused
 from robots import OWN
 
 import servoctl as sv
 from servoctl.gallery import gallery, scenes, six_axes
+from servoctl.gallery.attitude import tumbling_satellite
 from servoctl.gallery.chains import cable_robot
 from servoctl.gallery.contacts import ball_on_turntable, rolling_disc
 from servoctl.gallery.flexible import elastic_link, flexible_joint
 from servoctl.gallery.hitched import trailers
-from servoctl.gallery.jerk import constant_jerk
+from servoctl.gallery.jerk import constant_jerk, jerkless_trolley
 from servoctl.inversion.verdict import verdict
 from servoctl.jets.tape import Tape
 
@@ -139,6 +140,51 @@ def test_a_report_on_a_jerk_program_finds_no_rest_and_says_so():
     start = model.start(**scene.start, guess=scene.guess)
     report = sv.report(model, sv.simulate(model, start, (0.0, 1.0)))
     assert report.verdict == "marginal" and "no rest" in repr(report)
+
+
+@pytest.mark.parametrize("a", [-6.0, 0.5, 20.0])
+def test_a_rod_on_a_trolley_without_jerk_swings_in_a_steady_gravity(a):
+    run = moved(jerkless_trolley(), (0.0, 3.0), x=0.1, dx=-1.0, d2x=a, theta=0.0, dtheta=0.0)
+    assert run["x"] == pytest.approx(0.1 - run.t + a * run.t**2 / 2, abs=1e-9)
+    angle, rate = run["theta"], run["dtheta"]
+    assert rate**2 == pytest.approx(3.0 * (a * np.sin(angle) - 9.81 * (1 - np.cos(angle))), abs=1e-6)
+    turning = 1.5 * (a * np.cos(angle) - 9.81 * np.sin(angle))
+    force = 5.0 * a - 1.0 * (turning * np.cos(angle) - rate**2 * np.sin(angle))
+    names, reaction = run.signals("reaction")
+    assert names == ["reaction_x", "reaction_theta"]
+    assert reaction[0] == pytest.approx(force, abs=1e-6) and reaction[1] == pytest.approx(0.0, abs=1e-9)
+
+
+# a satellite whose energy falls --------------------------------------------------------------------------------------
+
+
+def braked(decay, weights="inertia"):
+    start = {"e1": 0.0, "e2": 0.0, "e3": 0.0, "w1": 0.25, "w2": 0.0}
+    return moved(tumbling_satellite(decay, weights), (0.0, 12.0), {"e0": 1.0, "w3": 0.35}, **start)
+
+
+@pytest.mark.parametrize("decay", [0.3, 0.02, -0.05])
+def test_torques_of_an_inertial_generalised_inverse_keep_the_direction_of_the_angular_momentum(decay):
+    run = braked(decay)
+    slowed = np.exp(-decay * run.t)
+    for name, J, rate in zip("123", (30.0, 40.0, 50.0), free_rates((1 - slowed) / decay), strict=True):
+        assert run[f"w{name}"] == pytest.approx(slowed * rate, abs=1e-9)
+        assert run[f"torque{name}"] == pytest.approx(-decay * J * slowed * rate, abs=1e-8)
+    for name, momentum in zip("xyz", (7.5, 0.0, 17.5), strict=True):  # to eight digits of its magnitude, 19 N m s
+        assert run[f"momentum_{name}"] == pytest.approx(slowed * momentum, abs=1e-8 * np.hypot(7.5, 17.5))
+
+
+def test_torques_of_the_pseudoinverse_lie_along_the_rates():
+    run, decay = braked(0.1, None), 0.1
+    w, torque = (np.array([run[f"{name}{i}"] for i in (1, 2, 3)]) for name in ("w", "torque"))
+    assert torque == pytest.approx(-8.0 * decay * np.exp(-2 * decay * run.t) / (w**2).sum(0) * w, abs=1e-8)
+    assert abs(run["momentum_y"]).max() > 0.01  # the direction of the angular momentum changes
+
+
+def test_a_program_that_is_singular_at_rest_names_no_rate_of_its_self_motion():
+    """The gradient of the energy vanishes with the rates: a linearisation at rest says nothing."""
+    said = repr(sv.derive(*tumbling_satellite()))
+    assert "self-motion of 2 velocities" in said and "at rest" not in said and "inf" not in said
 
 
 # a run whose pivots are others than the model's --------------------------------------------------------------------------

@@ -62,6 +62,8 @@ def tumbling_satellite(decay=0.1, weights="inertia"):
     change; its magnitude falls by exp(-decay t). The body goes through the attitudes of its free motion, and arrives
     at time t where that is at (1 - exp(-decay t))/decay. The plain pseudoinverse acts along the rates instead.
 
+    Servo constraints by generalised inverses are Bajodah's subject; the satellite and its numbers are not his.
+
     Parameters
     ----------
     decay : float

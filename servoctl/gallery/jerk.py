@@ -38,7 +38,7 @@ def jerkless_trolley():
     """A trolley with a swinging rod has no jerk: an ideal reaction, a force on the trolley, keeps its acceleration.
 
     Seen from the trolley, the rod swings in the constant gravity g - a: from rest in the vertical it comes to
-    2 arctan(a/g), and back.
+    2 arctan(a/g), and back. Constraints of higher order on several bodies are Liu's subject; this machine is not his.
 
     Returns
     -------

@@ -25,7 +25,7 @@ class SelfMotion:
         The number of its velocities.
     rate : float
         Largest real part of the eigenvalues of its velocities [1/s], over the points where ranks were decided; 0 where
-        nothing damps one, NaN beside residuals above order 2.
+        nothing damps one, NaN beside residuals above order 2, or where the program is singular at rest.
     """
 
     velocities: int
@@ -66,5 +66,7 @@ def self_motion(reduction):
     L, D, G = (m[regular].astype(float) for m in (L, D, G))
     N = np.linalg.svd(G)[2][:, len(held) :].swapaxes(1, 2)
     rates = np.linalg.eigvals(-np.linalg.solve(L @ N, D @ N))
-    slowest = float(rates.real.max(initial=-np.inf))
+    if not rates.size:
+        return SelfMotion(count, np.nan)
+    slowest = float(rates.real.max())
     return SelfMotion(count, slowest if abs(slowest) > DAMPED * np.abs(rates).max(initial=0.0) else 0.0)
