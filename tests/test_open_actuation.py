@@ -604,3 +604,8 @@ def test_wishes_with_unknown_symbols_are_refused():
     mechanism, program = ship(3, ("X", "Y"))
     with refused(SpecificationError, "stray"):
         sv.derive(mechanism, sv.Program(program.residuals, toward={"fore": ca.SX.sym("stray")}))
+
+
+@pytest.mark.parametrize(("weights", "norm"), [(None, "norm"), ("inertia", "weighted norm"), ({"shoulder": 2.0}, "weighted norm")])
+def test_a_model_names_the_norm_that_is_least(weights, norm):
+    assert f": of least {norm};" in repr(sv.derive(*arm(weights)))

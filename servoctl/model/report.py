@@ -87,7 +87,9 @@ def _open(r):
     m, k = len(r.mechanism.actuators), len(r.program.residuals)
     if r.program.by == "ideal" or not 0 < k < m:
         return []
-    chosen = "nearest to the wishes" if r.program.toward else "of least norm"
+    weighted = r.program.weights or r.program.metric == "inertia"
+    norm = "of least weighted norm" if weighted else "of least norm"
+    chosen = "nearest to the wishes" if r.program.toward else norm
     return [f"  {m} actuators for {k} residuals: {chosen}; {self_motion(r) or 'no self-motion'}"]
 
 
