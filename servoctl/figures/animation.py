@@ -282,12 +282,14 @@ def _unrolled(picture):
 
 def _in_place(picture, each):
     """Whether bodies in space, held at one point at most, are drawn over each other at most of the poses."""
+    if not picture.space:
+        return False
     points = [np.reshape(v, (2, -1, len(picture.t)))[..., ::each] for v in picture.shapes.values()]
     points = np.concatenate(points, axis=1)
     low, high = points.min(axis=1), points.max(axis=1)
     small = STILL * (high - low).max()
     held = points[:, np.ptp(points, axis=2).max(axis=0) <= small, 0]
-    if not picture.space or (held.max(axis=1, initial=-np.inf) - held.min(axis=1, initial=np.inf)).max() > small:
+    if (held.max(axis=1, initial=-np.inf) - held.min(axis=1, initial=np.inf)).max() > small:
         return False
     first, second = np.triu_indices(low.shape[1], 1)
     common = np.minimum(high[:, first], high[:, second]) - np.maximum(low[:, first], low[:, second])

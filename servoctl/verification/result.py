@@ -26,7 +26,7 @@ WORDS = {
     "loop limits": "inputs beyond their limits",
     "loop repeated": "all signals of the loop when it is run again",
 }
-RESIDUAL = "largest residual, of the constraint and of its derivatives"
+RESIDUAL = "largest residual at any level"
 
 
 def within(value, limit):
@@ -95,7 +95,7 @@ class Verification(Shown):
         lines = [f"Verification: {said}", *(f"  {doubt}" for doubt in self.doubts)]
         lines += [self._line(key, WORDS[key]) for key in WORDS if key in self.numbers]
         if worst:
-            lines.append(self._line(worst, f"largest residual at any level ({worst.removeprefix('residual ')})"))
+            lines.append(self._line(worst, f"{RESIDUAL} ({worst.removeprefix('residual ')})"))
         lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines[:MOST_LINES])
 
