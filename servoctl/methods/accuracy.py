@@ -84,7 +84,7 @@ def coarse(sizes, rtol):
 
 
 def absolute_tolerances(sizes, rtol):
-    """Absolute tolerances (n_x,) for a motion of sizes (n_x,) of which the default is no small part; None where it is."""
+    """Absolute tolerances (n_x,) for a motion of sizes (n_x,) where the default is no small part of them; else None."""
     moves = sizes > 0
     if not coarse(sizes, rtol).any():
         return None
@@ -92,9 +92,9 @@ def absolute_tolerances(sizes, rtol):
 
 
 def unlike_tolerances(levels, largest, sizes, atol=None):
-    """Absolute tolerances (n_x,) of entries that are too unlike for one tolerance of their level; None where they are not.
+    """Absolute tolerances (n_x,) for entries of a level that are too unlike for one of the level; else None.
 
-    Places in micrometres and angles, say. What the inertia makes of an entry tells a small one from rounding.
+    As places in micrometres beside angles. What the inertia makes of an entry tells a small one from rounding.
 
     Parameters
     ----------
