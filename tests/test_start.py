@@ -494,6 +494,19 @@ def test_a_car_by_rates_of_its_place_starts_from_rest_at_the_limit_of_its_motion
     assert [start["psi"], start["delta"]] == pytest.approx([0.0, np.arctan(1.1 * 2 / 3)], abs=1e-4)
 
 
+@pytest.mark.parametrize("t", [0.032, 0.05, 0.08, 3.95])
+def test_a_start_where_the_divisor_of_a_hidden_constraint_is_faint_is_refused(t):
+    """Just after rest and before it: directions that depend on squares of the speed would be rounding."""
+    model = by_rates()
+    with refused(sv.SingularProgram, "divides by", "of its usual size", rows=["X"]) as caught:
+        model.start(t)
+    later = caught.value.details["nearest_time"]
+    assert caught.value.details["size"] < 1e-6 and (later is None) == (t > 3)
+    for good in (0.1, later or 2.0):  # δ follows from the curvature of y = x²/3
+        x, delta = 3 * np.ravel(cf.rest_to_rest([good], 0, 0.0, 1.0, 4.0, 6))[0], model.start(good, x=0.0)["delta"]
+        assert delta == pytest.approx(np.arctan(1.1 * 2 / 3 / (1 + 4 * x**2 / 9) ** 1.5), abs=1e-8)
+
+
 def test_a_car_at_rest_with_given_directions_is_refused_as_it_stands_still():
     """Its hidden constraints are 0/0 at rest."""
     with refused(sv.SingularProgram, "stands still", "psi", "delta", t=0.0) as caught:

@@ -425,7 +425,6 @@ class TaylorSteps(Stepping):
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
-        plain = model.reduction.mechanism.q.plain
         self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
         self.integrated = self._integrated_levels()
