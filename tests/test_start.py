@@ -479,6 +479,21 @@ def test_the_rate_of_the_residual_leads_on_where_the_residual_itself_is_singular
     assert sv.verify(model, run).passed
 
 
+@pytest.mark.parametrize("curvature", [0.3, -0.1])
+def test_a_constant_curvature_is_programmed_by_its_rate(curvature):
+    """θ1 - θ2 changes by the speed times what vanishes on the circle: no velocity moves it there."""
+    mechanism, _ = trailers()
+    q = mechanism.q
+    _, _, _, first, last = q
+    error, speed = ca.tan(first - last) / 0.8 - curvature, {"speed": q.w()[0] - 1.0}
+    with refused(sv.SpecificationError, "q.dt(residual, 1)", rows=["curvature"]):
+        sv.derive(mechanism, sv.Program({"curvature": error} | speed))
+    model = sv.derive(mechanism, sv.Program({"curvature": q.dt(error)} | speed))
+    run = sv.simulate(model, model.start(theta1=np.arctan(0.8 * curvature), theta2=0.0), (0.0, 3.0))
+    assert np.tan(run["theta1"] - run["theta2"]) / 0.8 == pytest.approx(curvature, abs=1e-12)
+    assert run["theta2"] - run["theta2"][0] == pytest.approx(curvature * run.t, abs=1e-9) and sv.verify(model, run).passed
+
+
 def by_rates(speed=0.0):
     """The car along the parabola (s, s²/3), by the rates of its place."""
     mechanism = car()
