@@ -209,6 +209,12 @@ class DenseStretch(Stretch):
         return instants[max(int(np.searchsorted(np.abs(instants - instants[0]), abs(t - instants[0]))) - 1, 0)]
 
 
+def _strength(model, t, jets):
+    """The smallest pivot of a model at an instant, relative to its size where pivots were chosen; 0 without a value."""
+    pivots, sizes = np.abs(model.pivots_at(t, jets)), model.pivot_sizes
+    return float(np.nan_to_num(pivots / np.where(sizes > 0, sizes, 1.0), nan=0.0, posinf=0.0).min(initial=1.0))
+
+
 class Monitor:
     """Pivots and matrices of a model along a motion.
 
@@ -228,6 +234,7 @@ class Monitor:
         self.f, self.invariants = model.function("matrices"), model.function("invariants")
         self.l_names, self.b_names = model.leading_names()
         self.reference, self.lift = None, 1.0
+        self.earlier = () if before is None else (*(m for m in before.earlier if m is not model), before.model)
         self.balances = list(model.balances())
         self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
@@ -529,19 +536,36 @@ class Monitor:
     def repivoted(self, t, x, top, same_rows=True):
         """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds.
 
-        With the same rows, which other pivots solve, or derived again.
+        With pivots that the motion had before, with others of the same rows, or derived again.
         """
         jets = np.append(x, np.nan_to_num(top))
-        if same_rows and self.rank_measure(t, x) > LOST:
-            other = self.model.without_choice or self._reordered(t, jets)
-            if other is not None:
-                return other, Monitor(other, t, x, self)
+        other = (self._before(t, jets) or self._of_same_rows(t, x, jets)) if same_rows else None
+        if other is not None:
+            return other, Monitor(other, t, x, self)
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
             model = self.model.near(t, jets, sizes)
             return model, Monitor(model, t, x, self)
         except ServoError:
             return None
+
+    def _before(self, t, jets):
+        """The strongest of the earlier variants of this motion; None if all have weak pivots at these jets."""
+        strengths = [(_strength(model, t, jets), -i, model) for i, model in enumerate(self.earlier)]
+        strength, _, model = max(strengths, default=(0.0, 0, None))
+        return model if strength > HELPS * DEGRADED else None
+
+    def _of_same_rows(self, t, x, jets):
+        """The model with other pivots of the same rows; None unless they are stronger, or the rows have lost rank."""
+        known = self.model.reduction.cascade is None  # else matrices have no value where pivots of a block vanish
+        if known and self.rank_measure(t, x) <= LOST:
+            return None
+        other = self.model.without_choice
+        if other is None:
+            other = self._reordered(t, jets)
+            helps = other is not None and _strength(other, t, jets) > _strength(self.model, t, jets)
+            return other if helps else None
+        return other
 
     def _reordered(self, t, jets):
         """The model with other pivots of the leading matrix, unless the rows divide by a pivot that is weak."""

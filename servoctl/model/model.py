@@ -10,7 +10,7 @@ import numpy as np
 
 from servoctl.checks import MOST_JETS, as_numbers, finite, named, whole
 from servoctl.codegen.function import compiled
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import ServoError, SingularProgram, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
 from servoctl.markup import Shown
@@ -277,16 +277,19 @@ class Model(Shown):
             None if the pivots stay, or are not those of the leading matrix.
         """
         r = self.reduction
-        if self.diagonal or r.cascade is not None or self.equations.sparse or (self.flat and self.nq != self.n):
+        if self.diagonal or self.equations.sparse or (r.cascade is None and self.flat and self.nq != self.n):
             return None
-        order = r.order_at(float(t), np.asarray(jets, dtype=float), self.parameters)
+        try:
+            order = r.order_at(float(t), np.asarray(jets, dtype=float), self.parameters)
+        except SingularProgram:
+            return None
         return None if order == r.order else self._formed(order)
 
     def _formed(self, form):
         """The model with the same rows, and pivots by their places, or from the diagonal; None without the latter."""
         key, r = repr((*(self._store.specification[3] or ()), form)), self.reduction
         if key not in self._variants:
-            reduction = definite(r) if form == DIAGONAL else replace(r, order=form)
+            reduction = definite(r) if form == DIAGONAL else r.with_order(form)
             store, functions = self._store.part(form), self._functions.setdefault(str(form), {})
             made = reduction and Model(reduction, store, self.parameters, self._knots, functions, self._variants)
             self._keep(key, made)
