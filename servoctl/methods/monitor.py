@@ -12,6 +12,7 @@ import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.methods.sizes import motion_sizes
+from servoctl.model.model import STRONG
 from servoctl.model.report import explain
 from servoctl.tolerances import ENTRY
 
@@ -207,12 +208,6 @@ class DenseStretch(Stretch):
             return self.t[k]
         instants = self.instants(k)
         return instants[max(int(np.searchsorted(np.abs(instants - instants[0]), abs(t - instants[0]))) - 1, 0)]
-
-
-def _strength(model, t, jets):
-    """The smallest pivot of a model at an instant, relative to its size where pivots were chosen; 0 without a value."""
-    pivots, sizes = np.abs(model.pivots_at(t, jets)), model.pivot_sizes
-    return float(np.nan_to_num(pivots / np.where(sizes > 0, sizes, 1.0), nan=0.0, posinf=0.0).min(initial=1.0))
 
 
 class Monitor:
@@ -551,28 +546,23 @@ class Monitor:
 
     def _before(self, t, jets):
         """The strongest of the earlier variants of this motion; None if all have weak pivots at these jets."""
-        strengths = [(_strength(model, t, jets), -i, model) for i, model in enumerate(self.earlier)]
+        strengths = [(model.strength(t, jets), -i, model) for i, model in enumerate(self.earlier)]
         strength, _, model = max(strengths, default=(0.0, 0, None))
-        return model if strength > HELPS * DEGRADED else None
+        return model if strength > STRONG else None
 
     def _of_same_rows(self, t, x, jets):
-        """The model with other pivots of the same rows; None unless they are stronger, or the rows have lost rank."""
+        """The model with other pivots of the same rows; None if there are none, or the rows have lost their rank."""
         known = self.model.reduction.cascade is None  # else matrices have no value where pivots of a block vanish
         if known and self.rank_measure(t, x) <= LOST:
             return None
-        other = self.model.without_choice
-        if other is None:
-            other = self._reordered(t, jets)
-            helps = other is not None and _strength(other, t, jets) > _strength(self.model, t, jets)
-            return other if helps else None
-        return other
+        return self.model.without_choice or self._reordered(t, jets)
 
     def _reordered(self, t, jets):
         """The model with other pivots of the leading matrix, unless the rows divide by a pivot that is weak."""
         count = len(self.model.row_pivots)
         pivots = np.abs(self.model.pivots_at(t, jets)[:count])
         sizes = self.model.pivot_sizes if self.reference is None else self.reference
-        strong = np.all(pivots > HELPS * DEGRADED * sizes[:count])
+        strong = np.all(pivots > STRONG * sizes[:count])
         return self.model.reordered(t, jets) if strong else None
 
     def failed(self, t, x, why, what, do):
