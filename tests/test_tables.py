@@ -23,6 +23,7 @@ from servoctl.jets import lookup
 from servoctl.jets.pieces import by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
+from servoctl.methods.taylor import TaylorSteps, last_index, series_loop
 from servoctl.spec import paths
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
@@ -318,6 +319,20 @@ def test_what_a_derivation_holds_does_not_depend_on_the_number_of_samples():
     few, many = sizes(300), sizes(20_000)
     assert few[:2] == many[:2]
     np.testing.assert_allclose(few[2], many[2], rtol=1e-6)
+
+
+def test_steps_end_at_knots_without_a_call_for_each(monkeypatch, c_compiler):
+    knots = np.linspace(0.0, 6.0, 600)
+    model = pendulum_cart(lambda t: sv.paths.spline(t, knots, np.sin(knots), 3, "natural"))
+    library, ends = series_loop(model, last_index(model, sv.Taylor()))._library, []
+    steps = library.taylor
+    monkeypatch.setattr(library, "taylor", lambda *given: ends.append(steps(*given)[1:, 0]) or steps(*given))
+    start = model.start(theta=0.1, dtheta=0.0)
+    run = sv.simulate(model, start, (0.0, 6.0), "Taylor", t_eval=np.linspace(0.0, 6.0, 61))
+    assert np.isin(knots[1:], np.concatenate(ends)).all()
+    assert len(ends) <= 1 + run.counters["steps"] // TaylorSteps.most
+    assert sv.verify(model, run).passed
+
 
 
 def test_an_exported_plan_holds_its_tables_of_data(monkeypatch, tmp_path, c_compiler):

@@ -47,7 +47,7 @@ def test_compiled_and_interpreted_steps_are_the_same(name, span, gallery_model, 
     p = np.append(model.parameters, 0.25)
     log = f.taylor(span[0], start.values, span[1], p, 1e-7, 1e-9, 100)
     f._place(f._interpreter, span[0], start.values, p)
-    again = f._interpreter.taylor(span[1], 1e-7, 1e-9, 0, 100)
+    again = f._interpreter.taylor(np.array([span[1]]), 1e-7, 1e-9, 0, 100)
     n_x = len(start.values)
     np.testing.assert_allclose(again[:, : 1 + n_x], log[:, : 1 + n_x], rtol=1e-11, atol=1e-11)
     t = np.linspace(*span, 41)
@@ -236,3 +236,36 @@ def test_matrices_have_the_velocities_that_rows_determine(span):
     moved[f.sizes["nq"] :] += 0.1 * (1 - np.array(f.sizes["free"]))
     assert f(span[0], moved, p) == pytest.approx(f(span[0], state, p), rel=1e-13, abs=1e-13)
     assert f.others["settled"](span[0], moved, p) == pytest.approx(f.others["settled"](span[0], state, p))
+
+
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize("natural", [True, False])
+def test_one_call_over_many_knots_has_the_bits_of_a_call_for_each_piece(forward, natural, c_compiler):
+    q = sv.coordinates("x theta")
+    x, theta = q
+    bob = (x + ca.sin(theta), -ca.cos(theta))
+    gibbs = sv.particle(q, 2.0, (x, 0.0)) + sv.particle(q, 0.5, bob)
+    machine = sv.Mechanism(q, gibbs=gibbs, potential=4.9 * bob[1], actuators={"F": x})
+    knots = np.linspace(0.0, 6.0, 60 if natural else 300)  # coefficients in sums, and in tables
+    path = sv.paths.spline(q.t, knots, np.sin(knots), 3, "natural" if natural else "rest")
+    model = sv.derive(machine, sv.Program({"X": x - path}, by="actuators"))
+    ends = knots[(knots > 1.0) & (knots < 4.0)].tolist()
+    ends = [*ends, 4.0] if forward else [*ends[::-1], 1.0]
+    t = first = 1.0 if forward else 4.0
+    start, f, top = model.start(t=first, theta=0.1, dtheta=0.0).values, series_loop(model, 11), model.reduction.top
+    p, state, rows = np.append(model.parameters, np.nan), start, []
+    for end in ends:
+        piece = f.taylor(t, state, end, p, 1e-8, 1e-9, 100)
+        rows, t, state = [*rows, *piece[:-1]], end, piece[-1, 1 : 1 + start.size]
+    at_once = f.taylor(first, start, ends, p, 1e-8, 1e-9, 10_000)
+    np.testing.assert_array_equal(at_once[:-1], rows)
+    np.testing.assert_array_equal(at_once[-1, : 1 + start.size], [t, *state])
+    f._place(f._interpreter, first, start, p)
+    again = f._interpreter.taylor(np.array(ends), 1e-8, 1e-9, 0, 10_000)
+    np.testing.assert_allclose(again[:, : 1 + start.size], at_once[:, : 1 + start.size], rtol=1e-10, atol=1e-10)
+    k = np.arange(len(rows))
+    middle = (at_once[1:, 0] + at_once[:-1, 0]) / 2
+    expected = f.jets(at_once, k, middle, p, top, by_rows=True)
+    compared = np.empty_like(expected)
+    f._interpreter.jets(at_once, k, middle, p, (top, start.size + model.n), compared)
+    np.testing.assert_allclose(compared, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max())
