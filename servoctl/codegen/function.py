@@ -402,8 +402,8 @@ class Compiled:
         x0 : (n_x,) array
             State at t0, SI.
         ends : float or (N,) array
-            Instants at which a step ends, in the direction of motion, the last one the end [s]. Between two of them paths
-            have one branch.
+            Instants at which a step ends, in the direction of motion, the last one the end [s]. Between two of them
+            paths have one branch.
         p : (n_p,) array
             Parameters, SI. The last one, the instant that selects the branches of paths, is set for each step.
         rtol, atol : float

@@ -40,7 +40,7 @@ class Workspace(threading.local):
         run, self._alive = connect(row, parts)
         self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
         self.start, self._log = row[: 1 + n_x + n_p], np.empty((0, 0))
-        self._task = np.zeros(8)  # the Steps of taylor.c: five numbers, the addresses of the start, the log and the ends
+        self._task = np.zeros(8)  # the Steps of taylor.c: five numbers, addresses of the start, the log, the ends
         self._task.view(np.int64)[5] = row.ctypes.data
         self.task, self.pointer = memoryview(self._task), ctypes.c_void_p(self._task.ctypes.data)
 

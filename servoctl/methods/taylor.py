@@ -436,7 +436,7 @@ class TaylorSteps(Stepping):
         return self.f(t, x, self._on_branch(t))
 
     def _on_branch(self, t):
-        """The parameters, and an instant between the same knots as what follows t, which selects the branches of paths."""
+        """The parameters, and an instant of the piece that follows t, which selects the branches of paths."""
         k = np.clip(self._next(t), 1, len(self.cuts) - 1)
         return np.append(self.model.parameters, self.cuts[k - 1 : k + 1].mean())
 
