@@ -242,9 +242,10 @@ class Stepping:
             t, x, cuts = t0, x0, breakpoints(self.span, knots)
             at_ends = (c for c in self.span if (np.abs(np.subtract(knots, c)) <= margin_at(c, self.span)).any())
             self.cuts, self.knots = np.array(cuts), {*cuts[1:-1], *at_ends}
+            ends = self._ends(cuts)
             self._start(t, x, cuts[1])
             self.motion.room = self._samples(cuts, t_eval)
-            for b in self._ends(cuts):
+            for b in ends:
                 while t != b and self.motion.stop is None and not self.motion.ended:
                     t, x = self._piece(t, x, b, self._due(t_eval, t, b))
         return self.motion

@@ -430,6 +430,7 @@ class TaylorSteps(Stepping):
 
     def _ends(self, cuts):
         """The end alone: the compiled loop ends steps at knots."""
+        self.ordered = self.cuts * np.sign(cuts[-1] - cuts[0])
         return cuts[-1:]
 
     def _outputs(self, t, x):
@@ -442,8 +443,7 @@ class TaylorSteps(Stepping):
 
     def _next(self, t):
         """The place of the first cut after t."""
-        forward = np.sign(self.span[1] - self.span[0])
-        return int(np.searchsorted(forward * self.cuts, forward * t, "right"))
+        return int(np.searchsorted(self.ordered, t * np.sign(self.cuts[-1] - self.cuts[0]), "right"))
 
     def _pivots(self, t, x):
         return self._outputs(t, x)[self.n_c :]
