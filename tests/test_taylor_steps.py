@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import make_interp_spline
 
 import servoctl as sv
 from servoctl.codegen.interpreted import rough_log2
@@ -269,3 +270,34 @@ def test_one_call_over_many_knots_has_the_bits_of_a_call_for_each_piece(forward,
     compared = np.empty_like(expected)
     f._interpreter.jets(at_once, k, middle, p, (top, start.size + model.n), compared)
     np.testing.assert_allclose(compared, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("samples", [30, 300])
+@pytest.mark.parametrize("span", [(0.0, 6.0), (5.9, 0.3)])
+def test_a_robot_that_turns_at_measured_rates_has_their_integral(samples, span, c_compiler):
+    """Velocities that rows determine, on both sides of knots: theta' is the spline, and theta its antiderivative."""
+    q = sv.coordinates("x y theta")
+    (x, y, theta), (dx, dy, dtheta) = q, q.d(1)
+    times = np.linspace(0.0, 6.0, samples)
+    rates = 0.4 * np.sin(2.0 * times) + 0.2
+    turn = sv.paths.spline(q.t, times, rates, 3, "natural")
+    S = sv.particle(q, 2.0, (x, y)) + 0.3 * q.d(2)[2] ** 2 / 2
+    wheel = {"wheel": dy * ca.cos(theta) - dx * ca.sin(theta)}
+    program = {"speed": dx * ca.cos(theta) + dy * ca.sin(theta) - 1.0, "turn": dtheta - turn}
+    model = sv.derive(sv.Mechanism(q, gibbs=S, constraints=wheel), sv.Program(program, by="ideal"))
+    start = model.start(t=span[0], x=0.0, y=0.0, theta=0.1)
+    t_eval = np.unique(np.concatenate([np.linspace(*sorted(span), 41), times[(times > 0.3) & (times < 5.9)]]))
+    run = sv.simulate(model, start, span, sv.Taylor(rtol=1e-10), t_eval=t_eval[:: 1 if span[0] < span[1] else -1])
+    curve = make_interp_spline(times, rates[:, None], k=5, bc_type=([(3, [0.0]), (4, [0.0])],) * 2)
+    angle = curve.antiderivative()
+    heading = 0.1 + angle(run.t)[:, 0] - angle(span[0])[0]
+    assert run.status == 0 and sv.verify(model, run).passed
+    np.testing.assert_allclose(run["theta"], heading, atol=1e-9)
+    np.testing.assert_allclose(run["dtheta"], curve(run.t)[:, 0], atol=1e-12)
+    np.testing.assert_allclose(run["dx"], np.cos(heading), atol=1e-9)
+    np.testing.assert_allclose(run["d2theta"], curve(run.t, nu=1)[:, 0], atol=1e-10)
+    middle = float(heading.min() + heading.max()) / 2
+    ends = sv.Event("theta", middle, terminal=True)
+    ended = sv.simulate(model, start, span, sv.Taylor(rtol=1e-10), events=ends)
+    reached = 0.1 + angle(ended.t[-1])[0] - angle(span[0])[0]
+    assert ended["theta"][-1] == pytest.approx(middle, abs=1e-9) and reached == pytest.approx(middle, abs=1e-9)
