@@ -461,10 +461,12 @@ def _run(model, motion, settings, start, t1):
 
 def _set_at_knots(t, jets, variants, knots):
     """Derivatives at knots by the equations at that instant: those of a series are of the side that it comes from."""
-    knots = np.asarray(knots, dtype=float)
+    knots = np.sort(knots)
     for first, end, model in variants if len(knots) else ():
-        near = np.abs(t[first:end, None] - knots) <= SAME_TIME * np.maximum(1.0, np.abs(knots))
-        at = first + np.flatnonzero(near.any(axis=1))
+        after = np.searchsorted(knots, t[first:end])
+        beside = knots[np.clip([after - 1, after], 0, len(knots) - 1)]
+        near = np.abs(t[first:end] - beside) <= SAME_TIME * np.maximum(1.0, np.abs(beside))
+        at = first + np.flatnonzero(near.any(axis=0))
         if len(at):
             n_x, top = len(model.state_names), len(model.jet_names)
             rates = model.function("ode").grid(t[at], jets[:n_x, at], model.parameters)

@@ -429,9 +429,22 @@ class TaylorSteps(Stepping):
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
         self.integrated = self._integrated_levels()
 
-    def _start(self, t, x, b):
-        self.p = np.append(self.model.parameters, (t + b) / 2)
-        super()._start(t, x, b)
+    def _ends(self, cuts):
+        """The end alone: the compiled loop ends steps at knots."""
+        self.ordered = self.cuts * np.sign(cuts[-1] - cuts[0])
+        return cuts[-1:]
+
+    def _outputs(self, t, x):
+        return self.f(t, x, self._on_branch(t))
+
+    def _on_branch(self, t):
+        """The parameters, and an instant of the piece that follows t, which selects the branches of paths."""
+        k = np.clip(self._next(t), 1, len(self.cuts) - 1)
+        return np.append(self.model.parameters, self.cuts[k - 1 : k + 1].mean())
+
+    def _next(self, t):
+        """The place of the first cut after t."""
+        return int(np.searchsorted(self.ordered, t * np.sign(self.cuts[-1] - self.cuts[0]), "right"))
 
     def _pivots(self, t, x):
         return self._outputs(t, x)[self.n_c :]
@@ -441,13 +454,14 @@ class TaylorSteps(Stepping):
         return np.zeros(self.n)
 
     def _piece(self, a, x, b, times):
-        self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
         self.monitor.begin(self._pivots(a, x))
         self.watch.begin(a)
         until = b
         while a != b and self.motion.stop is None:
-            rows = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
-            log = _Log(self.f, self.n_x, self.p, rows)
+            p, ends = self._on_branch(a), self.cuts[self._next(a) :]
+            ends = ends if until == b else np.append(ends[(ends < until) == (a < b)], until)
+            rows = self.f.taylor(a, x, ends, p, *self.tolerances, self.most, self.every)
+            log = _Log(self.f, self.n_x, p, rows)
             taken, good = len(rows) - 1, self._believed(log, abs(b - a))
             if good < taken:
                 self._doubt(log.t[good])
@@ -477,7 +491,7 @@ class TaylorSteps(Stepping):
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             row = np.concatenate([[a], x, self._outputs(a, x)])
-            self._sample(_Log(self.f, self.n_x, self.p, np.array([row, row])), times, a)
+            self._sample(_Log(self.f, self.n_x, self._on_branch(a), np.array([row, row])), times, a)
         return a, x
 
     def _leave_if_stiff(self, t, x):
@@ -558,7 +572,7 @@ class TaylorSteps(Stepping):
             k, at = np.append(k, steps_of(t, more)), np.append(at, more)
         within = at != t[k]
         if self.knots:  # where paths have other branches
-            within &= ~np.isin(at, list(self.knots))
+            within &= ~np.isin(at, [end for end in t.tolist() if end in self.knots])
         return k[within], at[within]
 
     def _stretch(self, log):

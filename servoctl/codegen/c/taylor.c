@@ -73,29 +73,43 @@ static inline void move(const double *x, const double *y, const double *c, doubl
     for (int64_t i = NQ; i < NX; i++) x_next[i] = IS_FREE(i - NQ) ? jet[i] : x[i];
 }
 
-/* Steps from the start (t, x, p) towards t1: at most max_steps, which may be projected. The log has a row (t, x, y) for
-   each step, and one more for the end. One pointer, since ctypes spends most of a call on converting arguments. */
+/* Steps from the start (t, x, p) towards the last of the ends, in the direction of motion, at each of which a step ends: at
+   most max_steps, which may be projected. The log has a row (t, x, y) for each step, and one more for the end. One pointer,
+   since ctypes spends most of a call on converting arguments. */
 typedef struct {
-    double t1, rtol, atol, project_every, max_steps;
+    double count, rtol, atol, project_every, max_steps;
     const double *start;
     double *log;
-    const double *weights;
+    const double *ends, *weights;
 } Steps;
+
+/* p, whose last number is the instant that selects the branches of paths. */
+static inline void on_branch(const double *p, double t, double *branch)
+{
+    for (int64_t i = 0; i < NP - 1; i++) branch[i] = p[i];
+    branch[NP - 1] = t;
+}
 
 /* Steps of the Taylor method. The function gives the coefficients of q (unless plain), those of gamma, and pivots.
    Returns the number of steps; fewer than max_steps without reaching t1 where a step vanishes or is not finite. */
 int64_t FN(taylor)(const Steps *s)
 {
-    const double *p = s->start + 1 + NX, log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, t1 = s->t1;
+    const double log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, *end = s->ends;
+    const double *last = end + (int64_t)s->count - 1;
     const int64_t max_steps = (int64_t)s->max_steps, project_every = (int64_t)s->project_every;
-    double t = s->start[0], *log = s->log;
+    double t = s->start[0], t1 = *end, *log = s->log, p[NP];
     for (int64_t i = 0; i < NX; i++) log[1 + i] = s->start[1 + i];
+    on_branch(s->start + 1 + NX, (t + t1) / 2, p);
     for (int64_t step = 0; ; step++) {
         double *x = log + 1, *y = x + NX, *row = y + NY, *x_next = row + 1;
         log[0] = t;
-        if (step == max_steps || t == t1) {
+        if (step == max_steps || t == *last) {
             settle(t, x, p);
             return step;
+        }
+        if (t == t1) {
+            t1 = *++end;
+            p[NP - 1] = (t + t1) / 2;
         }
         NAME(t, x, p, y);
         const double *c = y + (PLAIN ? 0 : NQ * LAST), *w = s->weights;
@@ -147,9 +161,11 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
     }
 #ifdef SETTLED
     for (int64_t at = 0; at < n && settled; at++) {
-        double x[NX + 1], all[NX + N];
+        const double *row = log + k[at] * (1 + NX + NY);
+        double x[NX + 1], branch[NP], all[NX + N];
         for (int64_t i = 0; i < NX; i++) x[i] = jets[i * n + at];
-        FN(settled)(t[at], x, p, all);
+        on_branch(p, (row[0] + row[1 + NX + NY]) / 2, branch);
+        FN(settled)(t[at], x, branch, all);
         for (int64_t i = NQ; i < settled; i++) jets[i * n + at] = all[i];
     }
 #else
