@@ -10,7 +10,8 @@ import pytest
 import servoctl as sv
 from servoctl import gallery
 from servoctl.codegen import emit
-from servoctl.codegen.chains import short_chains
+from servoctl.codegen.chains import short_chains, time_of
+from servoctl.codegen.collecting import ways
 from servoctl.codegen.compiler import library
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 4), ca.SX.sym("p", 3)
@@ -119,8 +120,8 @@ def test_rates_of_plants_have_shorter_chains_and_the_same_values(scene):
     plant = sv.plant(getattr(gallery, scene)()[0])
     f = plant.function("ode").expression
     given, short = statements(f, chained=False), statements(f)
-    assert chain(short) < chain(given)
-    assert len(short) <= 1.2 * len(given)
+    assert chain(short) <= chain(given)
+    assert len(short) < len(given) and time_of(short) < time_of(short_chains(given))
     evaluate, rng = compiled(f), np.random.default_rng(3)
     for _ in range(20):
         x, p = rng.normal(size=f.numel_in(1)), plant.p() * rng.uniform(0.5, 2, f.numel_in(2))
@@ -131,6 +132,75 @@ def test_rates_of_plants_have_shorter_chains_and_the_same_values(scene):
 def test_the_chain_of_the_crane_is_two_thirds():
     f = sv.plant(gallery.overhead_crane()[0]).function("ode").expression
     assert (chain(statements(f, chained=False)), chain(statements(f))) == (18, 12)
+
+
+OPERATIONS = {"overhead_crane": (80, 55), "furuta_pendulum": (134, 56), "rolling_disc": (128, 59), "bicycle": (97, 58)}
+
+
+@pytest.mark.parametrize("scene", OPERATIONS)
+def test_like_terms_of_an_elimination_are_collected(scene):
+    f = sv.plant(getattr(gallery, scene)()[0]).function("ode").expression
+    before, after = OPERATIONS[scene]
+    assert len(statements(f, chained=False)) >= before and len(statements(f)) <= after
+
+
+@pytest.mark.parametrize("scene, number", [("overhead_crane", 2), ("double_pendulum", 2), ("crane_3d", 2), ("furuta_pendulum", 2)])
+def test_the_fastest_way_is_taken(scene, number):
+    """As measured, of the ways by number: 57, 48, 46, 46; 81, 74, 69, 76; 110, 103, 103, 109; 90, 82, 49, 49 ns a step."""
+    f = sv.plant(getattr(gallery, scene)()[0]).function("ode").expression
+    given = emit.tabulated(emit._statements(f, emit.SCALAR_CHAINED))[0]
+    times = [time_of(short_chains(way)) for way in ways(given)]
+    assert times.index(min(times)) == number
+    assert statements(f) == short_chains(ways(given)[number])
+
+
+LIKE = {
+    "cancelling products": ((A * (SINE * X[1] + COSINE * X[2]) * COSINE - A * (COSINE * X[1] - SINE * X[2]) * SINE), 2),
+    "a quotient of products": (A * B * X[0] * X[1] / (B * X[0] * X[1] * X[1]), 2),
+    "a quotient of equal sums": ((A + X[1]) * X[2] / ((A + X[1]) * X[3]), 2),
+    "a difference of equal sums": ((A + X[1]) * X[2] - (A + X[1] - X[3]) * X[2], 1),
+    "one angle": (A + B - A * COSINE**2 - B * SINE**2 - B * COSINE**2, 3),
+    "a common factor": (A * X[1] * X[2] + A * X[1] * X[3] - A * X[1] * B, 4),
+    "nothing": (X[0] * X[1] - X[0] * X[1], 0),
+    "a product of sums": ((A + X[1]) * (B + X[2]) * (C + X[3]), 5),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LIKE)
+@pytest.mark.usefixtures("c_compiler")
+def test_no_more_operations_are_left_than_needed(name):
+    expression, most = LIKE[name]
+    f = function(expression)
+    arithmetic = [s for s in statements(f) if isinstance(s[0], int) and s[1] not in (ca.OP_SIN, ca.OP_COS)]
+    assert len(arithmetic) <= most
+    evaluate, rng = compiled(f), np.random.default_rng(len(name))
+    for _ in range(20):
+        x, p = rng.normal(size=4), rng.uniform(0.5, 2, 3)
+        np.testing.assert_allclose(evaluate(0.3, x, p), np.array(f(0.3, x, p)).ravel(), rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_all_ways_give_the_same_values(scene):
+    """In CasADi's arithmetic, as what the lanes of a batch compute is split off expressions."""
+    f = sv.plant(getattr(gallery, scene)()[0]).function("ode").expression
+    rng = np.random.default_rng(4)
+    x, p = rng.normal(size=f.numel_in(1)), rng.uniform(0.5, 2, f.numel_in(2))
+    exact = np.array(f(0.3, x, p)).ravel()
+    others = emit.other_ways(f)
+    assert len(others) == len(ways(statements(f, chained=False))) - 1
+    for way in others:
+        values = np.array(ca.Function("way", f.sx_in(), [way])(0.3, x, p)).ravel()
+        np.testing.assert_allclose(values, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+def test_small_differences_keep_their_digits():
+    """What is multiplied out has no differences of larger terms than before."""
+    f = function((X[0] - X[1]) * (X[0] + X[1]) * A + (X[0] - X[1]) ** 2 * B, (X[0] - X[1]) * A + (X[1] - X[0]) * B)
+    x, p = np.array([1.0, 1.0 + 1e-12, 0, 0]), [1.0, 3.0, 1.0]
+    values = [np.array(ca.Function("way", f.sx_in(), [way])(0, x, p)).ravel() for way in emit.other_ways(f)]
+    d = x[0] - x[1]
+    for value in values:
+        np.testing.assert_allclose(value, [d * (x[0] + x[1]) + 3 * d**2, -2 * d], rtol=1e-14)
 
 
 def test_a_long_function_is_left_as_it_is():

@@ -195,7 +195,9 @@ def finished(plant, law, plan, loop, conditions, advance=None):
     status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop, advance)
     if status == INTERRUPTED and not len(x):
         raise KeyboardInterrupt
-    t = loop.t0 + np.arange(len(x)) * loop.period
+    t = np.arange(len(x), dtype=float)
+    t *= loop.period
+    t += loop.t0
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.state)
     end = loop.t0 + len(x) * loop.period
     message = {
