@@ -39,7 +39,7 @@ def ways(statements):
     return [statements, *(_Collected(statements, added).written() for added in ADDED)]
 
 
-def _times(monomial, other):
+def _joined(monomial, other):
     """The product of two monomials, which are pairs (atom, power) in order."""
     powers = dict(monomial)
     for atom, power in other:
@@ -47,7 +47,7 @@ def _times(monomial, other):
     return tuple(sorted((atom, power) for atom, power in powers.items() if power))
 
 
-def _raised(monomial, power):
+def _power(monomial, power):
     return tuple((atom, power * n) for atom, n in monomial)
 
 
@@ -90,7 +90,7 @@ class _Collected:
             scale, powers = _POWERS[operation]
             factors = [(m, c, n) for n, (m, c) in zip(powers, map(self.term, given), strict=True)]
             c = scale * math.prod(c**n if c or n > 0 else math.inf for _, c, n in factors)
-            self.values[target] = {functools.reduce(_times, (_raised(m, n) for m, _, n in factors)): c}
+            self.values[target] = {functools.reduce(_joined, (_power(m, n) for m, _, n in factors)): c}
         else:
             terms = tuple(map(self.term, given))
             atom = self.atom((operation, terms))
@@ -117,13 +117,13 @@ class _Collected:
         if len(polynomial) < 2:
             return next(iter(polynomial.items()), ((), 0.0))
         common = _content(polynomial)
-        apart = {_times(m, _raised(common, -1)): c for m, c in polynomial.items()}
+        apart = {_joined(m, _power(common, -1)): c for m, c in polynomial.items()}
         sizes = {abs(c) for c in apart.values()}
         first = math.copysign(sizes.pop() if len(sizes) == 1 else 1.0, next(iter(apart.values())))
         apart = {m: c / first for m, c in apart.items()}
         sum_ = self.atom(frozenset(apart.items()))
         self.sums.setdefault(sum_, apart)
-        return _times(common, ((sum_, 1),)), first
+        return _joined(common, ((sum_, 1),)), first
 
     def collect(self, terms):
         """A sum with like terms collected, in which sums are multiplied out where terms cancel."""
@@ -148,9 +148,9 @@ class _Collected:
             given, result = result, Counter()
             for m, c in given.items():
                 there = (atom, 1) in m
-                rest = _times(m, ((atom, -1),)) if there else m
+                rest = _joined(m, ((atom, -1),)) if there else m
                 for n, d in self.sums[atom].items() if there else [((), 1.0)]:
-                    result[_times(rest, n)] += c * d
+                    result[_joined(rest, n)] += c * d
         result = self.of_one_angle({m: c for m, c in result.items() if c})
         return result if len(result) <= most else None
 
@@ -168,10 +168,10 @@ class _Collected:
                     continue
                 result = Counter()
                 for m, c in terms.items():
-                    rest = _times(m, ((square, -2),)) if dict(m).get(square, 0) > 1 else None
+                    rest = _joined(m, ((square, -2),)) if dict(m).get(square, 0) > 1 else None
                     result[m if rest is None else rest] += c
                     if rest is not None:
-                        result[_times(rest, ((other, 2),))] -= c
+                        result[_joined(rest, ((other, 2),))] -= c
                 result = {m: c for m, c in result.items() if c}
                 if len(result) < len(terms):
                     return self.of_one_angle(result)
@@ -222,7 +222,7 @@ class _Writer:
         common, sizes = _content(terms), {abs(c) for c in terms.values()}
         scale = sizes.pop() if len(sizes) == 1 else 1.0
         if common or scale != 1:
-            inner = {_times(m, _raised(common, -1)): c / scale for m, c in terms.items()}
+            inner = {_joined(m, _power(common, -1)): c / scale for m, c in terms.items()}
             return self.term(common, scale, self.polynomial(inner))
         shared = Counter((a, n > 0) for m in terms for a, n in m)
         (atom, positive), count = max(shared.items(), key=lambda item: item[1], default=((None, None), 0))

@@ -159,10 +159,10 @@ def other_ways(f):
     if any(not isinstance(operation, int) for _, operation, _ in statements):  # lookups
         return []
     inputs = dict(zip("txp", f.sx_in(), strict=True))
-    return [_expression(way, inputs) for way in ways(statements)[1:]]
+    return [_of_statements(way, inputs) for way in ways(statements)[1:]]
 
 
-def _expression(statements, inputs):
+def _of_statements(statements, inputs):
     """The outputs of statements as an SX column; `inputs` by name."""
     values, outputs = {}, []
 

@@ -74,17 +74,7 @@ def _derived(plant, law, disturbed, residuals):
     still = ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed))
     f, w, w_values = _fastest((t, x, p, rates), still, applied)
     t_k, row, written, common_values = _law_in_c(law)
-    phi = ca.SX(0, 1)
-    if residuals:
-        places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
-        # a single parameter indexed by [] is a row in CasADi, not a column
-        numbers = ca.vertcat(ca.SX(0, 1), *(constants[i] for i in places))
-        phi = residuals.expression(t_k, x, plant.state_names, numbers)
-    entries = plant.equations.dropped
-    if entries is not None:
-        values, sizes = ca.vertsplit(ca.fabs(entries.expression(t_k, x, p)), entries.n_y // 2)
-        phi = ca.vertcat(phi, ca.mmax(ca.if_else(sizes > 0, values / sizes, 0)))
-    phi, s, s_values = _apart(phi, t_k)
+    phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p), t_k)
     phi, v, v_values = _apart(phi, constants)
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
@@ -106,9 +96,23 @@ def _derived(plant, law, disturbed, residuals):
         emit.include("batch.c"),
     ]
     table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
-    text, watched = "".join(parts), int(entries is not None)
+    text, watched = "".join(parts), int(plant.equations.dropped is not None)
     table = compiled(table, "table")
     return Unit(text, table, plant.state_names, plant.inputs, residuals, len(law.measures), watched)
+
+
+def _signals(plant, residuals, t, x, p):
+    """Residuals, and the largest share of its terms that an entry left out by eliminations has."""
+    phi, entries = ca.SX(0, 1), plant.equations.dropped
+    if residuals:
+        places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
+        # a single parameter indexed by [] is a row in CasADi, not a column
+        numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in places))
+        phi = residuals.expression(t, x, plant.state_names, numbers)
+    if entries is not None:
+        values, sizes = ca.vertsplit(ca.fabs(entries.expression(t, x, p)), entries.n_y // 2)
+        phi = ca.vertcat(phi, ca.mmax(ca.if_else(sizes > 0, values / sizes, 0)))
+    return phi
 
 
 def _law_in_c(law):
