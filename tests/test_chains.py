@@ -13,6 +13,7 @@ from servoctl.codegen import emit
 from servoctl.codegen.chains import short_chains, time_of
 from servoctl.codegen.collecting import ways
 from servoctl.codegen.compiler import library
+from servoctl.jets.pieces import Constant
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 4), ca.SX.sym("p", 3)
 SINE, COSINE = ca.sin(X[0]), ca.cos(X[0])
@@ -191,6 +192,43 @@ def test_all_ways_give_the_same_values(scene):
     for way in others:
         values = np.array(ca.Function("way", f.sx_in(), [way])(0.3, x, p)).ravel()
         np.testing.assert_allclose(values, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+
+
+IN_LONG_NUMBERS = {
+    ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply, ca.OP_DIV: np.divide, ca.OP_NEG: np.negative,
+    ca.OP_SQ: np.square, ca.OP_TWICE: lambda a: 2 * a, ca.OP_INV: lambda a: 1 / a, ca.OP_SIN: np.sin, ca.OP_COS: np.cos,
+    ca.OP_TAN: np.tan,
+}  # fmt: skip
+
+
+def evaluated(given, t, x, p):
+    """The outputs of statements, in the type of x and p."""
+    values, outputs = {"t": t} | {f"x[{i}]": v for i, v in enumerate(x)} | {f"p[{i}]": v for i, v in enumerate(p)}, {}
+    for target, operation, operands in given:
+        operands = [v.value if isinstance(v, Constant) else values[v] for v in operands]
+        if isinstance(target, str):
+            outputs[int(target[2:-1])] = operands[0] + 0 * x[0]
+        else:
+            values[target] = IN_LONG_NUMBERS[operation](*operands)
+    return np.array([outputs[i] for i in range(len(outputs))])
+
+
+@pytest.mark.parametrize("scene", (*SCENES, "planar_arm", "trailers", "bicycle", "four_bar"))
+def test_collected_rates_are_as_accurate_in_all_units(scene):
+    """Against extended precision, with states and parameters of all sizes."""
+    plant = sv.plant(getattr(gallery, scene)()[0])
+    f, rng = plant.function("ode").expression, np.random.default_rng(5)
+    x = rng.normal(size=(f.numel_in(1), 2000)) * 10 ** rng.uniform(-3, 1, 2000)
+    p = (plant.p() + 10.0 * (plant.p() == 0))[:, None] * 10 ** rng.uniform(-1, 1, (f.numel_in(2), 2000))
+    given = statements(f, chained=False)
+    exact = evaluated(given, 0.3, x.astype(np.longdouble), p.astype(np.longdouble))
+
+    def error(some):
+        errors = (np.abs(evaluated(some, 0.3, x, p) - exact) / np.abs(exact).max(axis=0)).max(axis=0).astype(float)
+        return np.median(errors), np.percentile(errors, 99)
+
+    for own, reference in zip(error(statements(f)), error(given), strict=True):
+        assert own <= 2 * reference + np.finfo(float).eps
 
 
 def test_small_differences_keep_their_digits():
