@@ -87,6 +87,8 @@ class Dialect:
         Whether the text holds the numbers of large tables; otherwise they are set when its library is loaded.
     chained : bool
         Whether each evaluation waits for the one before: the statements of one chunk are those of `short_chains`.
+    collected : bool
+        Whether like terms of these are collected before.
     """
 
     number: str = "double"
@@ -98,6 +100,7 @@ class Dialect:
     exact: bool = False
     whole: bool = False
     chained: bool = False
+    collected: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -134,7 +137,7 @@ class Dialect:
 SCALAR = Dialect(forms=_FORMS_OF_ONE)
 EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
-SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True)
+SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True, collected=True)
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
 EXPORTED = replace(PORTABLE, whole=True)
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
@@ -154,9 +157,10 @@ def cost(f, dialect):
 
 
 def other_ways(f):
-    """Outputs equal to that of an SX function (t, x, p) but for rounding, with like terms collected."""
+    """Outputs equal to that of a short SX function (t, x, p) but for rounding, with like terms collected."""
     statements = _statements(f, SCALAR)
-    if any(not isinstance(operation, int) for _, operation, _ in statements):  # lookups
+    lookups = any(not isinstance(operation, int) for _, operation, _ in statements)
+    if lookups or len(statements) > CHUNK:
         return []
     inputs = dict(zip("txp", f.sx_in(), strict=True))
     return [_of_statements(way, inputs) for way in ways(statements)[1:]]
@@ -315,7 +319,8 @@ def _prepared(f, dialect, suffix=""):
     header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
     if not dialect.exact:
         chained = dialect.chained and len(statements) <= CHUNK
-        statements = min(map(short_chains, ways(statements)), key=time_of) if chained else _with_reciprocals(statements)
+        some = ways(statements) if chained and dialect.collected else [statements]
+        statements = min(map(short_chains, some), key=time_of) if chained else _with_reciprocals(statements)
     return statements, [*header, *tables]
 
 
