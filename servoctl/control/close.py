@@ -147,7 +147,8 @@ def loop_of(plant, law, x0, t_span, conditions):
         measured=np.array([plant.state_names.index(name) for name in law.measures], dtype=np.int64),
         disturbed=disturbed, initial_input=initial,
         disturbance=conditions.forces(t0, law.period / substeps, samples * substeps),
-        noise=sensors.noisy(law.measures, samples + 1), quantum=sensors.quantum(law.measures),
+        noise=sensors.noisy(law.measures, samples + 1) if sensors.noise else None,
+        quantum=sensors.quantum(law.measures) if sensors.quantisation else None,
         low=low, high=high, change=change, transport=transport,
     )  # fmt: skip
 
