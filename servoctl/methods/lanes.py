@@ -2,6 +2,7 @@
 
 import ctypes
 import os
+import sys
 from functools import lru_cache
 from threading import Thread
 
@@ -20,10 +21,11 @@ from servoctl.model.switching import switching
 
 MOST_IN_LANES = 10**6  # of a case
 SHOWN_EVERY = 0.1  # s between two looks at how far the threads are
+IN_CALLER = 4e6  # operations, a few milliseconds, which the calling thread does before it starts others
 
 _NUMBERS = ("t0", "t1", "rtol", "longest")
-_COUNTS = ("max_steps", "n_times", "n_cuts", "n_cases", "next", "stop")
-_ARRAYS = ("x0", "p", "atol", "pivots", "times", "cuts", "ends", "samples")
+_COUNTS = ("max_steps", "n_times", "n_cuts", "n_cases", "most", "next", "stop")
+_ARRAYS = ("order", "x0", "p", "atol", "pivots", "times", "cuts", "ends", "samples")
 _KINDS = {ctypes.c_double: _NUMBERS, ctypes.c_int64: _COUNTS, ctypes.c_void_p: _ARRAYS}
 
 
@@ -36,17 +38,26 @@ class _Many(ctypes.Structure):
         super().__init__(**numbers, **{name: pointer(array) for name, array in arrays.items()})
         self.arrays = arrays
 
-    def run(self, library, threads, progress):
-        """Call a C function on threads; whether Ctrl-C ended it."""
-        workers = [Thread(target=library, args=(ctypes.byref(self),)) for _ in range(threads)]
+    def run(self, library, operations, threads, progress):
+        """Call a C function of so many operations a step; whether Ctrl-C ended it.
+
+        It begins in the calling thread: others take longer to start than many problems take.
+        """
+        n, workers = self.n_cases, []
         try:
+            self.most = max(int(IN_CALLER / operations), 1)
+            library(ctypes.byref(self))
+            order = np.flatnonzero(self.arrays["ends"][:, 0] == 0)
+            self.arrays["order"], self.order = order, pointer(order)
+            self.most, self.n_cases, self.next = sys.maxsize, len(order), 0
+            workers += [Thread(target=library, args=(ctypes.byref(self),)) for _ in range(min(threads, len(order)))]
             for worker in workers:
                 worker.start()
             for worker in workers:
                 while worker.is_alive():
                     worker.join(SHOWN_EVERY)
                     if progress:
-                        progress(min(self.next, self.n_cases))
+                        progress(n - self.n_cases + min(self.next, self.n_cases))
         except KeyboardInterrupt:
             self.stop = 1  # which the threads read at each step
             for worker in workers:
@@ -96,10 +107,10 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
     p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects branches of paths
     arrays = {"x0": x0, "p": p, "atol": atol, "pivots": model.pivot_sizes, "times": times}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
-    arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
+    arrays |= _results(n, len(times), n_x)
     many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times), n_cases=n)
     threads = min(threads or os.cpu_count() or 1, -(-n // compiler.lanes()))
-    interrupted = many.run(library, threads, progress)
+    interrupted = many.run(library, f.operations, threads, progress)
     return arrays["ends"], arrays["samples"], interrupted
 
 
@@ -130,13 +141,19 @@ def plan_many(model, span, cases, times, threads=None, progress=None):
     cuts = breakpoints(span, model.require_smooth((min(span), max(span))))
     arrays = {"x0": x0, "p": p, "pivots": model.pivot_sizes, "times": times, "cuts": cuts}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
-    arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
+    arrays |= _results(n, len(times), n_x)
     counts = {"max_steps": NODES, "n_times": len(times), "n_cuts": len(cuts), "n_cases": n}
     many = _Many(arrays, t0=span[0], t1=span[1], longest=abs(span[1] - span[0]) / STEPS, **counts)
-    interrupted = many.run(library, min(threads or os.cpu_count() or 1, n), progress)
+    interrupted = many.run(library, f.operations, min(threads or os.cpu_count() or 1, n), progress)
     ends, samples = arrays["ends"], arrays["samples"]
     ends[:, 3 : 3 + n_x] = samples[:, -1]
     return ends, samples, interrupted
+
+
+def _results(n, n_times, n_x):
+    """Arrays for the results of N cases, none of which was computed yet, and the order in which they will be."""
+    order, samples = np.arange(n), np.full((n, n_times, n_x), np.nan)
+    return {"order": order, "ends": np.zeros((n, 3 + 2 * n_x)), "samples": samples}
 
 
 def _library(f, n_x):

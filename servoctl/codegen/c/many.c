@@ -151,8 +151,8 @@ void FN(many)(Many *m)
     Motions s = {0};
     int64_t open = 0;
     for (int64_t lane = 0; lane < W_LANES; lane++) open += load(m, lane, &s);
-    while (open) {
-        if (stopped(m)) return;
+    for (int64_t steps = 0; open; steps++) {
+        if (stopped(m) || steps == m->most) return;
         expansion(s.t, s.x, s.p, s.y);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
         W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
