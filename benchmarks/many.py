@@ -10,7 +10,7 @@ from appell_hamel import COARSE, DURATION, START, P, constrained, ladder, rollin
 from harness import Missing, Row, fastest, installed
 
 import servoctl as sv
-from servoctl.methods.lanes import integrate
+from servoctl.methods.lanes import OF_A_CASE, integrate
 
 CASES, WITHIN, BATCH = 1000, 1e-6, 8
 NAMES = ("x", "y", "z", "phi", "theta")
@@ -73,7 +73,7 @@ def lanes(scene, last, rtol):
 
     def call():
         x, *_ = integrate(model, last, (0.0, DURATION), cases, rtol, np.zeros(0), threads=1)
-        return np.where(x[:, 0] == 1, x[:, 3 : 3 + start.values.size].T, np.nan)[columns]
+        return np.where(x[:, 0] == 1, x[:, len(OF_A_CASE) :][:, : start.values.size].T, np.nan)[columns]
 
     return call
 

@@ -28,7 +28,7 @@ from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
-from servoctl.model.validity import affirmed
+from servoctl.model.validity import affirmed, points_with
 from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.definite import Definite, definite
@@ -569,6 +569,11 @@ class Model(Shown):
         """
         here = self.reduction.points.at(np.array([t]), jets[:, None], self.parameters)
         return here.evaluate([pivot for _, pivot in self.equations.pivots])[0][:, 0].astype(float)
+
+    @cached_property
+    def rank_points(self):
+        """States (n_x, points) at which ranks were decided, with the model's own parameters."""
+        return points_with(self)
 
     @cached_property
     def pivot_sizes(self):

@@ -29,7 +29,7 @@ static int pivots_fall(const Many *m, int64_t n, const double *nodes)
 static int64_t plan(const Many *m, int64_t at, double *nodes, double *x, double *y)
 {
     const double *p = m->p + at * NP;
-    double *row = m->ends + at * (3 + 2 * STATE), *samples = m->samples + at * m->n_times * STATE;
+    double *row = m->ends + at * (RESULTS + 2 * STATE), *samples = m->samples + at * m->n_times * STATE;
     int64_t count;
     const int64_t n = FN(continuation)(m->n_cuts, m->cuts, m->x0 + at * STATE, p, m->longest, m->max_steps, nodes, &count);
     row[0] = STUCK;
