@@ -17,10 +17,12 @@ typedef struct {
     int64_t of[W_LANES], sampled[W_LANES];
 } Motions;
 
+/* `rough_log2` of series.h in lanes, as a polynomial of the mantissa, 1 + f. */
 INLINE W w_rough_log2(W a)
 {
-    const W f = w_value((w_bits(a) & 0x000fffffffffffffLL) | 0x3ff0000000000000LL) - 1.0;
-    return __builtin_convertvector((w_bits(a) >> 52) - 1023, W) + f * (1.0 + BEND - BEND * f);
+    const W mantissa = w_value((w_bits(a) & 0x000fffffffffffffLL) | 0x3ff0000000000000LL);
+    const W exponent = __builtin_convertvector(w_bits(a) >> 52, W) - (1024.0 + 2 * BEND);
+    return exponent + mantissa * (1.0 + 3 * BEND - BEND * mantissa);
 }
 
 INLINE W w_rough_exp2(W a)
@@ -34,8 +36,11 @@ INLINE W w_rough_exp2(W a)
 INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     W largest = ALL(0.0);
+    int some = 0;
     for (int64_t i = 0; i < n; i++) {
-        if (!level || IS_FREE((level - 1) * N + i)) largest = w_larger_size(w_fabs(v[i]), largest);
+        if (level && !IS_FREE((level - 1) * N + i)) continue;
+        largest = some ? w_larger_size(w_fabs(v[i]), largest) : w_fabs(v[i]);
+        some = 1;
     }
     return largest;
 }
@@ -49,9 +54,9 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_r
         const int64_t k = term(m);
         if (k <= level || k == 0) continue;
         const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, level));
-        const W growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
-        const W h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
-        shortest = w_lesser(h, shortest);
+        const double part = 1.0 / (double)(k - level);
+        const double all = log_rtol * (1.0 / (double)(LAST - level)) - rough_log2(falling(k, level)) * part;
+        shortest = w_lesser((scale - size) * part + all, shortest);
     }
     return shortest;
 }
@@ -59,8 +64,8 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_r
 /* gamma^(j) or, for j = 0, the change of q, a time h after the expansion. */
 INLINE W w_series(const W *c, int64_t n, int64_t i, int64_t j, W h)
 {
-    W total = ALL(0.0);
-    for (int64_t k = LAST; k >= (j ? j : 1); k--) total = total * h + falling(k, j) * c[(k - 1) * n + i];
+    W total = falling(LAST, j) * c[(LAST - 1) * n + i];
+    for (int64_t k = LAST - 1; k >= (j ? j : 1); k--) total = total * h + falling(k, j) * c[(k - 1) * n + i];
     return j ? total : total * h;
 }
 
