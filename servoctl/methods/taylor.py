@@ -432,8 +432,8 @@ class TaylorSteps(Stepping):
         self.p = np.append(self.model.parameters, (t + b) / 2)
         super()._start(t, x, b)
 
-    def _pivots(self, t, x):
-        return self._outputs(t, x)[self.n_c :]
+    def _pivots_of(self, outputs):
+        return outputs[self.n_c :]
 
     def _top(self, t, x):
         """Zeros for γ^(s̄): it only starts the search for other pivots, and its value would cost a series."""
