@@ -427,7 +427,7 @@ class Compiled:
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        return self._library.taylor(np.atleast_1d(np.asarray(ends, dtype=float)), rtol, atol, every, max_steps)
+        return self._library.taylor(ends, rtol, atol, every, max_steps)
 
     def jets(self, log, k, t, p, levels, by_rows=False):
         """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.
