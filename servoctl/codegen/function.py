@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.interpreted import Interpreter, restored, restored_grid
+from servoctl.codegen.interpreted import Interpreter, restored, restored_grid, weighted
 from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library, builtin
 from servoctl.codegen.tables import BOUND
@@ -407,7 +407,8 @@ class Compiled:
         p : (n_p,) array
             Parameters, SI. The last one, the instant that selects the branches of paths, is set for each step.
         rtol, atol : float
-            Tolerances of each level of the state: relative to its largest entry, and absolute.
+            Tolerances of each level of the state: relative to its largest entry, and absolute. With atol (n_x,), of a
+            level each of whose entries is measured in its own absolute tolerance.
         max_steps : int
             Largest number of steps.
         project_every : int
@@ -427,7 +428,8 @@ class Compiled:
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        return self._library.taylor(ends, rtol, atol, every, max_steps)
+        atol, weights = weighted(atol)
+        return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
 
     def jets(self, log, k, t, p, levels, by_rows=False):
         """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.

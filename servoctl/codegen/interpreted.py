@@ -40,7 +40,7 @@ class Workspace(threading.local):
         run, self._alive = connect(row, parts)
         self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
         self.start, self._log = row[: 1 + n_x + n_p], np.empty((0, 0))
-        self._task = np.zeros(8)  # the Steps of taylor.c: five numbers, addresses of the start, the log, the ends
+        self._task = np.zeros(9)  # the Steps of taylor.c: five numbers; addresses of start, log, ends, weights
         self._end = np.zeros(1)
         self.end, self._addresses = memoryview(self._end), memoryview(self._task.view(np.int64))
         self._addresses[5], self._own = row.ctypes.data, self._end.ctypes.data
@@ -60,6 +60,11 @@ class Workspace(threading.local):
         else:
             self._ends = np.atleast_1d(np.ascontiguousarray(ends, dtype=float))
             self.task[0], self._addresses[7] = self._ends.size, self._ends.ctypes.data
+
+    def weigh(self, weights):
+        """Set the weights of the Taylor method, None for 1."""
+        self._weights = weights  # which must live as long as the call
+        self._addresses[8] = 0 if weights is None else weights.ctypes.data
 
 
 class Blocks(threading.local):
@@ -188,13 +193,14 @@ class Interpreter:
         return column - 1
 
     @np.errstate(all="ignore")
-    def taylor(self, ends, rtol, atol, every, max_steps):
+    def taylor(self, ends, rtol, atol, every, max_steps, weights=None):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
         start, n_x = self.workspace.start.copy(), self._n_x
         t, x, p, rows, (t1, *later) = start[0], start[1 : 1 + n_x], start[1 + n_x :], [], np.atleast_1d(ends)
         p[-1] = (t + t1) / 2
         free = np.array(self._sizes.get("free", [1] * (n_x - nq)), dtype=bool).reshape(top - 1, n)
+        w = np.ones(n_x) if weights is None else weights
         while True:
             if len(rows) == max_steps or t == (later or [t1])[-1]:
                 x = self._settle(t, x, p)
@@ -205,9 +211,9 @@ class Interpreter:
             y = self._value(t, x, p)
             of_q = y[: nq * last].reshape(last, nq)
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
-            levels = zip(x[nq:].reshape(top - 1, n), free, strict=True)
-            of_rates = (longest(level[i], c[:, i], j, rtol, atol) for j, (level, i) in enumerate(levels, 1))
-            h = rough_exp2(min(longest(x[:nq], of_q, 0, rtol, atol), *of_rates))
+            levels = zip(*(part[nq:].reshape(top - 1, n) for part in (x, w)), free, strict=True)
+            of_rates = (longest((u * v)[i], (u * c)[:, i], j, rtol, atol) for j, (v, u, i) in enumerate(levels, 1))
+            h = rough_exp2(min(longest(w[:nq] * x[:nq], w[:nq] * of_q, 0, rtol, atol), *of_rates))
             if not h > 1e-13 * (1 + abs(t)):
                 x = self._settle(t, x, p)
                 break
@@ -343,6 +349,13 @@ def rough_exp2(a):
     """Its inverse, as in taylor.c."""
     whole, f = divmod(min(max(a, -1022.0), REST), 1.0)
     return ldexp(1.0 + f * (1.0 - BEND + BEND * f), int(whole))
+
+
+def weighted(atol):
+    """The least absolute tolerance and weights (n_x,) by which each entry has this one; None for a number."""
+    if np.ndim(atol) == 0:
+        return atol, None
+    return atol.min(), atol.min() / atol
 
 
 def longest(level, c, j, rtol, atol):

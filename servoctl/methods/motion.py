@@ -43,6 +43,7 @@ class Motion:
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one
     room: int = 0  # samples of the whole motion
+    largest: float | np.ndarray = 0.0  # magnitudes (n_x,) of X at the ends of steps
     _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _jets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -86,6 +87,10 @@ class Motion:
     def by_piece(self):
         """The (model, t, jets) of each piece."""
         return [(model, self._t[a:b], self._jets[:, a:b]) for model, _, a, b in self.pieces]
+
+    def reaches(self, x):
+        """Take in the states (n_x, S) at the ends of steps."""
+        self.largest = np.fmax(self.largest, np.abs(x).max(axis=1))
 
     def end_before(self, t, error):
         """Drop the samples from an instant t [s] on, and stop there for an error."""
@@ -290,6 +295,7 @@ class Stepping:
     def _inspected(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
         outcome = self._smooth(stretch)
+        self.motion.reaches(stretch.x[:, : outcome.steps + 1])
         return outcome if self.events is None else self._event(stretch, outcome) or outcome
 
     def _event(self, stretch, outcome):

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import Compiled, compiled
+from servoctl.codegen.interpreted import weighted
 from servoctl.errors import SingularProgram
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.identity import spread, vanish
@@ -404,8 +405,8 @@ class TaylorSteps(Stepping):
     model : Model
     drift : None or Project
     method : Taylor
-    atol : float
-        Its absolute tolerance.
+    atol : float or (n_x,) array
+        Its absolute tolerance; entries of a level are compared in their own ones.
     progress : callable
     """
 
@@ -425,8 +426,8 @@ class TaylorSteps(Stepping):
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
-        plain = model.reduction.mechanism.q.plain
-        self.n_c = (0 if plain else self.nq * last) + self.n * last
+        self.plain = model.reduction.mechanism.q.plain
+        self.n_c = (0 if self.plain else self.nq * last) + self.n * last
         self.integrated = self._integrated_levels()
 
     def _ends(self, cuts):
@@ -530,20 +531,28 @@ class TaylorSteps(Stepping):
         k, at = self._instants(log)
         jets = log.jets(k, at, self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
-        rtol, atol = self.tolerances
-        off, h, last, wrong = np.abs(rates - jets[-n:]), np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
-        farthest, longest = off.max(axis=1), h.max()
+        rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
+        off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
+        h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
+        longest = h.max()
         for level, entries in self.integrated.items():
             raised, part = self.top - level, perm(last, level) / perm(last, self.top - 1)
-            state = log.states[: self.nq] if level == 0 else log.states[self.nq + (level - 1) * n :][:n]
-            largest = np.abs(state).max()
-            if longest**raised * part * farthest[entries].max() <= FAR_OFF * (atol + rtol * largest):
+            state, missed, highest = np.abs(log.states[self._level(level)]), off[entries], top[entries]
+            if weights is not None and (level or self.plain):
+                w = weights[self._level(level), None]
+                state, missed, highest = w * state, w[entries] * missed, w[entries] * highest
+            largest = state.max()
+            if longest**raised * part * missed.max() <= FAR_OFF * (atol + rtol * largest):
                 continue
             part = h[k] ** raised * part
-            sizes = np.maximum(largest, np.abs(part * jets[-n:][entries]).max(axis=0))
-            error = (part * off[entries]).max(axis=0)
+            sizes = np.maximum(largest, (part * highest).max(axis=0))
+            error = (part * missed).max(axis=0)
             wrong |= (error > FAR_OFF * (atol + rtol * sizes)) & (h[k] > SMALLEST * span)
         return int(k[wrong].min(initial=len(t) - 1))
+
+    def _level(self, level):
+        """The places in the state of q, or of γ^(level)."""
+        return slice(self.nq + (level - 1) * self.n, self.nq + level * self.n) if level else slice(0, self.nq)
 
     def _integrated_levels(self):
         """Entries of γ by the highest level at which they are integrated, 0 where only q is."""
