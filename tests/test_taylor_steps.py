@@ -50,7 +50,9 @@ def test_compiled_and_interpreted_steps_are_the_same(name, span, unlike, gallery
     atol = np.geomspace(1e-9, 1e-13, len(start.values)) if unlike else 1e-9
     log = f.taylor(span[0], start.values, span[1], p, 1e-7, atol, 100)
     f._place(f._interpreter, span[0], start.values, p)
-    again = f._interpreter.taylor(span[1], 1e-7, atol.min() if unlike else atol, 0, 100, atol.min() / atol if unlike else None)
+    weights = atol.min() / atol if unlike else None
+    ends = np.array([span[1]])
+    again = f._interpreter.taylor(ends, 1e-7, atol.min() if unlike else atol, 0, 100, weights)
     n_x = len(start.values)
     np.testing.assert_allclose(again[:, : 1 + n_x], log[:, : 1 + n_x], rtol=1e-11, atol=1e-11)
     t = np.linspace(*span, 41)

@@ -453,8 +453,8 @@ class TaylorSteps(Stepping):
         """The place of the first cut after t."""
         return bisect_right(self.cuts, self.forward * t, key=lambda cut: self.forward * cut)
 
-    def _pivots(self, t, x):
-        return self._outputs(t, x)[self.n_c :]
+    def _pivots_of(self, outputs):
+        return outputs[self.n_c :]
 
     def _top(self, t, x):
         """Zeros for γ^(s̄): it only starts the search for other pivots, and its value would cost a series."""

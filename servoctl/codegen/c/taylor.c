@@ -80,8 +80,7 @@ typedef struct {
     double count, rtol, atol, project_every, max_steps;
     const double *start;
     double *log;
-    const double *ends;
-    const double *weights;
+    const double *ends, *weights;
 } Steps;
 
 /* p, whose last number is the instant that selects the branches of paths. */
