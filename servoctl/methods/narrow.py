@@ -11,7 +11,7 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.jets.branches import steep_arguments
 
-ASIDE = 0.7  # change of an argument from its zero, at which odd functions of it are large, such as s exp(-s²)
+BESIDE_ZERO = 0.7  # change of an argument from its zero, at which odd functions of it are large, such as s exp(-s²)
 SECANTS, MOST_SECANTS = 4, 60  # of a zero between two instants, least and most
 LOCATED = 1e-2  # argument at which a zero is located well enough
 CLOSE = 1e-8  # of an interval, over which an argument is a straight line
@@ -101,7 +101,7 @@ def _zeros(function, a, b, left, right):
         if not np.any(value) or (step >= SECANTS - 1 and not np.any(np.abs(value) > LOCATED)):
             break
     h = CLOSE * (end - start)
-    return _aside(s, ASIDE * 2 * np.abs(h) / np.abs(function(s + h) - function(s - h)), start, end)
+    return _aside(s, BESIDE_ZERO * 2 * np.abs(h) / np.abs(function(s + h) - function(s - h)), start, end)
 
 
 def _vertices(t, size, i, j):
@@ -110,7 +110,7 @@ def _vertices(t, size, i, j):
     d0, d1 = (size[i, j] - size[i, j - 1]) / h0, (size[i, j + 1] - size[i, j]) / h1
     s = t[j] - (d0 * h1 + d1 * h0) / (2 * (d1 - d0))
     s = np.where(np.isfinite(s), s, t[j])
-    return _aside(s, np.sqrt(ASIDE * np.abs((h0 + h1) / (d1 - d0))), t[j - 1], t[j + 1])
+    return _aside(s, np.sqrt(BESIDE_ZERO * np.abs((h0 + h1) / (d1 - d0))), t[j - 1], t[j + 1])
 
 
 def _aside(s, distance, a, b):
