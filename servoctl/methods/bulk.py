@@ -6,10 +6,12 @@ function in the equations may be narrow. Steps up to the first one that does not
 that instant, so that its stages see what it stepped over.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from servoctl.errors import IntegrationStopped
 from servoctl.methods.choice import MinimalCoordinates
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
@@ -135,16 +137,22 @@ class BulkSteps(Stepping):
         k, at, x, rates = self.net
         steep = arguments(self.model)
         if steep is not None:
-            first = stretch.t[:1], stretch.x[:, :1]
-            parts = np.append(first[0], at), np.column_stack([first[1], x])
-            more = centres(steep, self.model.parameters, *parts, lambda s: stretch.dense(steps_of(stretch.t, s), s))
-            k, at = np.append(k, steps_of(stretch.t, more)), np.append(at, more)
-            added = stretch.dense(k[len(self.net[0]) :], more)
-            x = np.column_stack([x, added])
-            rates = np.column_stack([rates, self.f.grid(more, added, self.p)[: self.n_x]])
+            with suppress(IntegrationStopped):  # where values that are solved for jump, which is told elsewhere
+                k, at, x, rates = self._at_centres(stretch, steep)
         h = np.diff(stretch.t)
         inside = (at != stretch.t[k]) & (at != stretch.t[k + 1]) & (np.abs(h[k]) > SHORTEST * self.watch.span)
         return self._defect(stretch, h, k[inside], at[inside], x[:, inside], rates[:, inside])
+
+    def _at_centres(self, stretch, steep):
+        """The net with the instants about zeros of steep arguments."""
+        k, at, x, rates = self.net
+        first = stretch.t[:1], stretch.x[:, :1]
+        parts = np.append(first[0], at), np.column_stack([first[1], x])
+        more = centres(steep, self.model.parameters, *parts, lambda s: stretch.dense(steps_of(stretch.t, s), s))
+        places = steps_of(stretch.t, more)
+        added = stretch.dense(places, more)
+        rates = np.column_stack([rates, self.f.grid(more, added, self.p)[: self.n_x]])
+        return np.append(k, places), np.append(at, more), np.column_stack([x, added]), rates
 
     def _defect(self, stretch, h, k, at, x, rates):
         rtol, atol = self.tolerances
