@@ -492,3 +492,11 @@ def test_an_executor_that_was_shut_down_is_refused():
     executor.shutdown()
     with refused(ServoError, {"cases": 2}):
         sv.simulate_many(pendulum(), {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1), executor=executor)
+
+
+def test_a_disc_far_from_the_origin_rolls_as_at_it(gallery_model):
+    """Its angles have a tolerance of their own, in lanes, too."""
+    model, scene, t = gallery_model("rolling-disc"), gallery["rolling-disc"], np.linspace(0.0, 2.0, 11)
+    near, far = (sv.simulate_many(model, scene.start | {"x": x}, None, (0.0, 2.0), t_eval=t) for x in (0.0, 1e7))
+    for name in ("lean", "psi", "dphi"):
+        assert far.trace[name] == pytest.approx(near.trace[name], abs=1e-7), name

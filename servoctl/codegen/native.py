@@ -55,11 +55,13 @@ class Library:
             pointer(outputs),
         )
 
-    def taylor(self, t1, rtol, atol, every, max_steps):
+    def taylor(self, ends, rtol, atol, every, max_steps, weights=None):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         workspace = self.workspace
         log, task = workspace.log(max_steps + 1, self._columns), workspace.task
-        task[0], task[1], task[2], task[3], task[4] = t1, rtol, atol, every, max_steps
+        workspace.until(ends)
+        workspace.weigh(weights)
+        task[1], task[2], task[3], task[4] = rtol, atol, every, max_steps
         return log[: self._taylor(workspace.pointer) + 1].copy()
 
     @functools.cached_property

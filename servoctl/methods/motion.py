@@ -43,6 +43,7 @@ class Motion:
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one
     room: int = 0  # samples of the whole motion
+    largest: float | np.ndarray = 0.0  # magnitudes (n_x,) of X at the ends of steps
     _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _jets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -86,6 +87,10 @@ class Motion:
     def by_piece(self):
         """The (model, t, jets) of each piece."""
         return [(model, self._t[a:b], self._jets[:, a:b]) for model, _, a, b in self.pieces]
+
+    def reaches(self, x):
+        """Take in the states (n_x, S) at the ends of steps."""
+        self.largest = np.fmax(self.largest, np.abs(x).max(axis=1))
 
     def end_before(self, t, error):
         """Drop the samples from an instant t [s] on, and stop there for an error."""
@@ -143,9 +148,9 @@ def margin_at(t, span):
 
 def breakpoints(span, knots):
     """The span cut at the knots inside it, in the direction of integration."""
-    t0, t1 = span
+    (t0, t1), knots = span, np.asarray(knots, dtype=float)
     low, high = min(span), max(span)
-    inside = [k for k in knots if low + margin_at(low, span) < k < high - margin_at(high, span)]
+    inside = knots[(knots > low + margin_at(low, span)) & (knots < high - margin_at(high, span))].tolist()
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
 
 
@@ -203,6 +208,7 @@ class Stepping:
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
     knots = frozenset()  # inside the span
+    cuts = np.zeros(0)  # at which steps end: the ends of the span, and these knots
     again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
@@ -239,14 +245,25 @@ class Stepping:
             self.span = t0, t1
             self._watch(t0, x0, t1)
             t, x, cuts = t0, x0, breakpoints(self.span, knots)
-            self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c, self.span) for k in knots)}
+            at_ends = (c for c in self.span if (np.abs(np.subtract(knots, c)) <= margin_at(c, self.span)).any())
+            self.cuts, self.knots = np.array(cuts), {*cuts[1:-1], *at_ends}
+            ends = self._ends(cuts)
             self._start(t, x, cuts[1])
             self.motion.room = self._samples(cuts, t_eval)
-            for b in cuts[1:]:
+            for b in ends:
                 while t != b and self.motion.stop is None and not self.motion.ended:
-                    due = (t_eval >= min(t, b)) & (t_eval <= max(t, b)) & ((t_eval != t) | (t == t0))
-                    t, x = self._piece(t, x, b, t_eval[due])
+                    t, x = self._piece(t, x, b, self._due(t_eval, t, b))
         return self.motion
+
+    def _ends(self, cuts):
+        """The ends of the pieces that are integrated one after the other."""
+        return cuts[1:]
+
+    def _due(self, t_eval, t, b):
+        """The instants of samples after t, or from the start on, up to b."""
+        forward = np.sign(self.span[1] - self.span[0])
+        before = np.searchsorted(forward * t_eval, forward * t, "left" if t == self.span[0] else "right")
+        return t_eval[before : np.searchsorted(forward * t_eval, forward * b, "right")]
 
     def _samples(self, cuts, t_eval):
         """The number of samples of a whole motion through instants (K,) at which pieces end."""
@@ -275,6 +292,7 @@ class Stepping:
     def _inspected(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
         outcome = self._smooth(stretch)
+        self.motion.reaches(stretch.x[:, : outcome.steps + 1])
         return outcome if self.events is None else self._event(stretch, outcome) or outcome
 
     def _event(self, stretch, outcome):

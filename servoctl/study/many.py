@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.methods.accuracy import ATOL, LARGE, coarse
+from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
 from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
-from servoctl.methods.sizes import sizes_of
+from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -267,8 +267,7 @@ class _Many:
             return
         x, largest = np.split(ends[:, 3:], 2, axis=1)
         good = (ends[:, 0] > 0) & self._consistent(span[0], x0, p) & self._consistent(span[1], x, p)
-        if method.atol is None:
-            good &= self._default_fits(span, (x0, p), largest, rtol)
+        good &= self._tolerances_fit(span, (x0, p), largest, method)
         self._take(which, ends, samples, good)
 
     def plans(self, span, times, threads, progress):
@@ -337,15 +336,17 @@ class _Many:
             sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x.T))[:, None] ** 2).sum(axis=0))
             return ~(np.abs(y[:m]) > OFF * np.where(sizes > 0, sizes, 1.0)).any(axis=0)
 
-    def _default_fits(self, span, cases, largest, rtol):
-        """Whether the default absolute tolerance is a small part of the sizes (N, n_x) of a motion, and no rounding."""
-        small = largest.max(axis=1) <= LARGE
-        some = np.flatnonzero((largest < ATOL / rtol).any(axis=1))
+    def _tolerances_fit(self, span, cases, largest, method):
+        """Whether motions with magnitudes (N, n_x) need no tolerances of their own, as `simulate` decides it."""
+        default, levels = method.atol is None, state_levels(self.model)
+        fit = (largest.max(axis=1) <= LARGE) | (not default)
+        some = np.flatnonzero(((largest < ATOL / method.rtol) & default).any(axis=1) | unlike(levels, largest.T))
         if len(some):
             x0, p = (part[some].T for part in cases)
             inertia = self.model.function("matrices").grid(span[0], x0, p)[-self.model.n :]
-            small[some] &= ~coarse(sizes_of(self.model, inertia, largest[some].T, span[1] - span[0]), rtol).any(axis=0)
-        return small
+            sizes = sizes_of(self.model, inertia, largest[some].T, span[1] - span[0])
+            fit[some] &= ~unlike(levels, largest[some].T, sizes) & ~(coarse(sizes, method.rtol).any(axis=0) & default)
+        return fit
 
     def one_by_one(self, span, method, times, progress):
         """Compute the others as `simulate` does."""
