@@ -139,7 +139,6 @@ def simulate(
     """
     model, start = _model_and_start(model, start, inputs)
     span = as_span(t_span)
-    times = None if t_eval is None else _sample_times(*span, t_eval, (), method)
     events = as_events(events)
 
     def motion(times):
@@ -149,7 +148,8 @@ def simulate(
         return attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
 
     if not _has_internal_dynamics(model) or not _integrates(method):
-        return motion(times)
+        return motion(t_eval)
+    times = None if t_eval is None else _sample_times(*span, t_eval, (), method)
     tolerance, own = getattr(method, "rtol", STEP_ERROR), partial(_with_own, method, span, times)
     try:
         enough = own(FEWEST + 1)

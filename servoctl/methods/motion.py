@@ -61,8 +61,8 @@ class Motion:
     def _end(self):
         return self.pieces[-1][-1] if self.pieces else 0
 
-    def add(self, model, t, x, top):
-        """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
+    def add(self, model, t, *levels):
+        """Append samples t (N,) and the levels of their jets, (m, N) each, computed with one variant of the model."""
         start, t = self._end, np.asarray(t)
         shared = int(start > 0 and len(t) > 0 and t[0] == self._t[start - 1])
         further = t[1:] != t[:-1]
@@ -72,9 +72,11 @@ class Motion:
         if end == start:
             return
         if end > len(self._t):
-            self._reserve(max(end, 2 * start, min(self.room, MOST_RESERVED)), len(x) + len(top))
-        self._t[start:end] = t[new]
-        self._jets[: len(x), start:end], self._jets[len(x) :, start:end] = x[:, new], top[:, new]
+            self._reserve(max(end, 2 * start, min(self.room, MOST_RESERVED)), sum(map(len, levels)))
+        self._t[start:end], row = t[new], 0
+        for level in levels:
+            self._jets[row : row + len(level), start:end] = level[:, new]
+            row += len(level)
         self.pieces.append((model, start - shared, start, end))
 
     def _reserve(self, room, rows):
@@ -148,7 +150,10 @@ def margin_at(t, span):
 
 def breakpoints(span, knots):
     """The span cut at the knots inside it, in the direction of integration."""
-    (t0, t1), knots = span, np.asarray(knots, dtype=float)
+    t0, t1 = span
+    if not len(knots):
+        return [t0, t1]
+    knots = np.asarray(knots, dtype=float)
     low, high = min(span), max(span)
     inside = knots[(knots > low + margin_at(low, span)) & (knots < high - margin_at(high, span))].tolist()
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
@@ -208,7 +213,7 @@ class Stepping:
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
     knots = frozenset()  # inside the span
-    cuts = np.zeros(0)  # at which steps end: the ends of the span, and these knots
+    cuts = ()  # at which steps end: the ends of the span, and these knots
     again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
@@ -246,7 +251,7 @@ class Stepping:
             self._watch(t0, x0, t1)
             t, x, cuts = t0, x0, breakpoints(self.span, knots)
             at_ends = (c for c in self.span if (np.abs(np.subtract(knots, c)) <= margin_at(c, self.span)).any())
-            self.cuts, self.knots = np.array(cuts), {*cuts[1:-1], *at_ends}
+            self.cuts, self.knots = cuts, {*cuts[1:-1], *at_ends} if len(knots) else frozenset()
             ends = self._ends(cuts)
             self._start(t, x, cuts[1])
             self.motion.room = self._samples(cuts, t_eval)
@@ -380,20 +385,28 @@ class Stepping:
     def _start(self, t, x, b):
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
         self.monitor = Monitor(self.model, t, x)
-        if self.monitor.bad_choice(self._outputs(t, x), self._pivots(t, x)):
+        if self.monitor.bad_choice(*self._with_pivots(t, x)):
             for same_rows in (True, False):  # whose rows may divide by a pivot that is zero there
                 variant = self.monitor.repivoted(t, x, self._top(t, x), same_rows)
                 if variant is not None:
                     self._go_on(variant, t, x)
-                if not self.monitor.without_value(self._outputs(t, x), self._pivots(t, x)):
+                if not self.monitor.without_value(*self._with_pivots(t, x)):
                     break
-            self.motion.stop = self.monitor.refuse_start(t, x, self._outputs(t, x), self._pivots(t, x))
+            self.motion.stop = self.monitor.refuse_start(t, x, *self._with_pivots(t, x))
 
     def _outputs(self, t, x):
         return self.f(t, x, self.p)
 
+    def _with_pivots(self, t, x):
+        """The outputs at a state, and the pivots among them."""
+        outputs = self._outputs(t, x)
+        return outputs, self._pivots_of(outputs)
+
     def _pivots(self, t, x):
-        return self._outputs(t, x)[self.n_x :]
+        return self._pivots_of(self._outputs(t, x))
+
+    def _pivots_of(self, outputs):
+        return outputs[self.n_x :]
 
     def _top(self, t, x):
         """γ^(s̄) at a state."""

@@ -344,9 +344,10 @@ def _independent_in_q(q, rows, points):
 
 def _beyond_velocities(q, names):
     listed, velocities = ", ".join(names), ", ".join(q.velocity_names)
-    given = f"The residuals {listed} are independent, but the velocities {velocities} move them in dependent directions."
     if len(names) == 1:
         given = f"The residual {listed} restricts coordinates, but none of the velocities {velocities} moves it there."
+    else:
+        given = f"The residuals {listed} are independent, but {velocities} move them in dependent directions."
     return SpecificationError(
         given,
         "Hidden constraints of quasi-velocities are derived from rates where residuals outnumber the directions in "

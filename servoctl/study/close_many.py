@@ -77,7 +77,7 @@ def close_many(
     every : int
         Traces have every n-th sample.
     threads : int, optional
-        Default: one per core.
+        Default: one per core. There is no executor: disturbances may be functions that no process can be sent.
 
     Returns
     -------
