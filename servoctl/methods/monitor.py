@@ -359,7 +359,7 @@ class Monitor:
         Fine, Repivot or Singular
         """
         n_g, count, m = stretch.pivots.shape
-        if not stretch.pivots.size:
+        if not stretch.pivots.size or self._all_strong(stretch.pivots.reshape(n_g, -1)):
             return Fine(count)
         pole = self._pole(stretch)
         if pole is not None:
@@ -384,6 +384,19 @@ class Monitor:
             self.sunk = None
         self.recent = track[:, -2:]
         return Fine(count)
+
+    def _all_strong(self, pivots):
+        """Whether pivots (n_g, N) keep their signs and their sizes so well that nothing else needs to be inspected."""
+        last, sizes = self.recent[:, -1], np.abs(pivots)
+        before = np.maximum(sizes[:, :-1].max(axis=1, initial=0.0), self.reference)
+        largest = np.maximum(before, sizes[:, -1])
+        weakest = np.minimum((pivots * np.sign(last)[:, None]).min(axis=1), np.abs(last) * largest)
+        usual = np.maximum(self.reference, self.model.pivot_sizes)
+        if not ((weakest > DEGRADED * largest).all() and (NEGLIGIBLE * largest <= usual).all()):
+            return False
+        earlier = pivots[:, -2] / before if pivots.shape[1] > 1 else last
+        self.sunk, self.reference, self.recent = None, largest, np.array([earlier, pivots[:, -1] / largest]).T
+        return True
 
     def _pole(self, stretch):
         """Singular where a pivot grows without bound in one step, as that of a row divided by a speed that vanishes."""

@@ -28,7 +28,7 @@ from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
-from servoctl.model.validity import affirmed
+from servoctl.model.validity import affirmed, points_with
 from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.definite import Definite, definite
@@ -615,6 +615,11 @@ class Model(Shown):
         pivots, sizes = np.abs(self.pivots_at(t, jets)), self.pivot_sizes
         relative = pivots / np.where(sizes > 0, sizes, 1.0)
         return float(np.nan_to_num(relative, nan=0.0, posinf=0.0).min(initial=1.0))
+
+    @cached_property
+    def rank_points(self):
+        """States (n_x, points) at which ranks were decided, with the model's own parameters."""
+        return points_with(self)
 
     @cached_property
     def pivot_sizes(self):
