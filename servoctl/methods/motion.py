@@ -43,6 +43,7 @@ class Motion:
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one
     room: int = 0  # samples of the whole motion
+    drifted: float = np.nan  # largest residual at t1, relative to its gradient times the state; NaN if it is not known
     _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _jets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -75,6 +76,10 @@ class Motion:
         self._t[start:end] = t[new]
         self._jets[: len(x), start:end], self._jets[len(x) :, start:end] = x[:, new], top[:, new]
         self.pieces.append((model, start - shared, start, end))
+
+    def fill(self, model, t, jets):
+        """Set all samples t (N,) and jets (n_z, N), computed with one variant of the model."""
+        self.pieces, self._t, self._jets = [(model, 0, 0, len(t))], np.array(t), jets
 
     def _reserve(self, room, rows):
         """Make room for samples; the system gives memory as they fill it."""
