@@ -39,7 +39,7 @@ static double scaled(const double *y, const double *x)
 static int dense(const Steps *s, const Whole *w)
 {
 #ifdef SETTLED
-    if (!w->count || w->times[0] != s->start[0] || w->times[w->count - 1] != s->t1) return 0;
+    if (!w->count || w->times[0] != s->start[0] || w->times[w->count - 1] != *s->ends) return 0;
     for (int64_t at = 1; at < w->count; at++) {
         if (!(fabs(w->times[at] - w->times[at - 1]) <= w->distance)) return 0;
     }
@@ -82,19 +82,20 @@ static void compare(const double *row, double h, double end, int by_samples, con
     }
 }
 
-/* Returns the number of steps; -1 where they do not reach the end. In this order, `facts` are: how far gamma^(s) of the
+/* Returns the number of steps to the only one of the ends; -1 where they do not reach it. In this order, `facts` are: how far gamma^(s) of the
    series is at most from that of the equations (N), the longest step, at the ends of all steps the largest size of each
    state (NX), after each step that of each invariant (INVARIANTS), the least size of each pivot (N_PIVOTS), 0 where its
    sign changes, and its largest one (N_PIVOTS), the outputs of `invariants` at the
    start, and the largest of them at the end, relative to its gradient times the state. */
 int64_t FN(whole)(const Steps *s, const Whole *w)
 {
-    const double *p = s->start + 1 + NX;
+    double p[NP];
     const int64_t steps = FN(taylor)(s), columns = 1 + NX + NY;
     double *end = s->log + steps * columns, *farthest = w->facts, *longest = farthest + N, *states = longest + 1;
     double *residuals = states + NX, *least = residuals + INVARIANTS, *most = least + N_PIVOTS, *start = most + N_PIVOTS;
     const int by_samples = dense(s, w);
-    if (end[0] != s->t1) return -1;
+    if (end[0] != *s->ends) return -1;
+    on_branch(s->start + 1 + NX, (s->start[0] + *s->ends) / 2, p);
     NAME(end[0], end + 1, p, end + 1 + NX);
     for (double *fact = farthest; fact < start; fact++) *fact = 0;
     for (int64_t i = 0; i < N_PIVOTS; i++) least[i] = INFINITY;
@@ -114,13 +115,13 @@ int64_t FN(whole)(const Steps *s, const Whole *w)
         widen(longest, fabs(row[columns] - row[0]));
         compare(row, row[columns] - row[0], row[columns], by_samples, w, p, farthest);
     }
-    const double forward = s->t1 > s->start[0] ? 1 : -1;
+    const double forward = *s->ends > s->start[0] ? 1 : -1;
     for (int64_t at = 0, step = 0; at < w->count; at++) {
         while (step < steps - 1 && forward * s->log[(step + 1) * columns] <= forward * w->times[at]) step++;
         w->k[at] = step;
     }
     FN(taylor_jets)(s->log, w->count, w->k, w->times, p, TOP, 0, w->jets);
-    by_rows(w->count, w->times, p, NX + N, w->jets, farthest);
+    by_rows(s->log, w->count, w->k, w->times, p, NX + N, w->jets, farthest);
     return steps;
 }
 
