@@ -229,6 +229,9 @@ class Interpreter:
                 x = self._restore(t, self._settle(t, x, p), p)
         return np.array([*rows, np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])])
 
+    def whole(self, *_):
+        """None: without a compiler a motion is no single call."""
+
     def jets(self, log, k, t, p, counts, z):
         """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""
         nq, n, last, plain = (self._sizes[key] for key in ("nq", "n", "last", "plain"))
