@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, quiet_by_series
-from servoctl.methods.accuracy import ATOL, absolute_tolerances, accurate, large_tolerances, method_for
+from servoctl.methods.accuracy import (
+    ATOL,
+    absolute_tolerances,
+    accurate,
+    large_tolerances,
+    method_for,
+    unlike_tolerances,
+)
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded
 from servoctl.methods.choice import (
@@ -40,6 +47,7 @@ from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
+from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
@@ -131,7 +139,6 @@ def simulate(
     """
     model, start = _model_and_start(model, start, inputs)
     span = as_span(t_span)
-    times = None if t_eval is None else _sample_times(*span, t_eval, (), method)
     events = as_events(events)
 
     def motion(times):
@@ -141,7 +148,8 @@ def simulate(
         return attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
 
     if not _has_internal_dynamics(model) or not _integrates(method):
-        return motion(times)
+        return motion(t_eval)
+    times = None if t_eval is None else _sample_times(*span, t_eval, (), method)
     tolerance, own = getattr(method, "rtol", STEP_ERROR), partial(_with_own, method, span, times)
     try:
         enough = own(FEWEST + 1)
@@ -348,14 +356,16 @@ def _derived_along(model, method, drift, problem, bar):
 
 def _tolerant(model, method, drift, problem, bar):
     """Integrate with absolute tolerances that fit the motion: where the default is no small part of it, once more."""
-    if getattr(method, "atol", 0.0) is not None:
-        return _motion(model, method, drift, problem, bar)
     t0, x0, t1, *_ = problem
-    motion = _motion(model, method, drift, problem, bar, large_tolerances(model, (t0, t1), x0))
-    smaller = _smaller_tolerances(model, method, motion)
-    if smaller is None:
+    given, series = getattr(method, "atol", 0.0), isinstance(method, Taylor)
+    if given is not None and not series:
+        return _motion(model, method, drift, problem, bar)
+    large = large_tolerances(model, (t0, t1), x0) if given is None else None
+    motion = _motion(model, method, drift, problem, bar, large.min() if series and large is not None else large)
+    fitting = _fitting_tolerances(model, method, motion, t0)
+    if fitting is None:
         return motion
-    again = _motion(model, method, drift, problem, bar, smaller)
+    again = _motion(model, method, drift, problem, bar, fitting)
     return again if again.stop is None or motion.stop is not None else motion
 
 
@@ -389,10 +399,10 @@ def _with_events(motion, events):
 
 def _stepping(model, method, drift, span, bar, atol):
     """The integration by a method other than `Algebraic`."""
-    (t0, t1), least = span, ATOL if atol is None else atol.min()
+    (t0, t1), least = span, ATOL if atol is None else np.min(atol)
     match method:
         case Taylor():
-            return TaylorSteps(model, drift, method, method.atol or least, bar)
+            return TaylorSteps(model, drift, method, (method.atol or ATOL) if atol is None else atol, bar)
         case RadauIIA(order, step, rtol, given):
             step = None if step is None else _step_length(step, t0, t1)
             return RadauSteps(model, drift, rtol, given or least, order, step, bar)
@@ -405,16 +415,23 @@ def _stepping(model, method, drift, span, bar, atol):
             return ScipySteps(model, name, drift, rtol, given or each, bar)
 
 
-def _smaller_tolerances(model, method, motion):
-    """Absolute tolerances with which a motion is computed again, as the default is no small part of it; else None."""
-    if motion.interrupted or not motion.pieces:
+def _fitting_tolerances(model, method, motion, t0):
+    """Absolute tolerances with which a motion from t0 on is computed again, as it does not fit the first; else None."""
+    largest = motion.largest
+    if motion.interrupted or not motion.pieces or np.ndim(largest) == 0 or not np.isfinite(largest).all():
         return None
     if isinstance(method, RadauIIA) and method.step is not None:
         return None
-    finite = np.all(np.isfinite(motion.jets), axis=0)
-    x = motion.jets[: len(model.state_names)]
-    x = x if finite.all() else x[:, finite]
-    return absolute_tolerances(model, motion.t, x, method.rtol) if x.shape[1] > 1 else None
+    t, x = motion.t[-1], motion.jets[: len(model.state_names), -1]
+    inertia = model.function("matrices")(t, x, model.parameters)[-model.n :]
+    sizes = sizes_of(model, inertia, largest, t - t0)
+    if isinstance(method, Taylor):
+        unlike = unlike_tolerances(state_levels(model), largest, sizes, method.atol)
+        if unlike is not None or method.atol is not None:
+            return unlike
+        atol = absolute_tolerances(sizes, method.rtol)
+        return atol if atol is None else atol.min()
+    return absolute_tolerances(sizes, method.rtol)
 
 
 def _run(model, motion, settings, start, t1):
@@ -444,10 +461,12 @@ def _run(model, motion, settings, start, t1):
 
 def _set_at_knots(t, jets, variants, knots):
     """Derivatives at knots by the equations at that instant: those of a series are of the side that it comes from."""
-    knots = np.asarray(knots, dtype=float)
+    knots = np.sort(knots)
     for first, end, model in variants if len(knots) else ():
-        near = np.abs(t[first:end, None] - knots) <= SAME_TIME * np.maximum(1.0, np.abs(knots))
-        at = first + np.flatnonzero(near.any(axis=1))
+        after = np.searchsorted(knots, t[first:end])
+        beside = knots[np.clip([after - 1, after], 0, len(knots) - 1)]
+        near = np.abs(t[first:end] - beside) <= SAME_TIME * np.maximum(1.0, np.abs(beside))
+        at = first + np.flatnonzero(near.any(axis=0))
         if len(at):
             n_x, top = len(model.state_names), len(model.jet_names)
             rates = model.function("ode").grid(t[at], jets[:n_x, at], model.parameters)

@@ -4,6 +4,7 @@ import pickle
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from multiprocessing import get_context
+from threading import Thread
 
 import casadi as ca
 import numpy as np
@@ -115,6 +116,24 @@ def test_a_case_depends_neither_on_others_nor_on_threads(c_compiler):
     all_ = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 1.0), executor=2)
     some = sv.simulate_many(model, {"a": angles[100:103], "da": 0.0}, None, (0.0, 1.0), executor=1)
     assert np.array_equal(all_["final a"][100:103], some["final a"])
+
+
+@pytest.mark.parametrize("quick", [0.0, 1e5, 4e5, lanes.IN_CALLER])
+@pytest.mark.parametrize("n", [1, 3, 8, 1000])
+def test_what_the_calling_thread_leaves_others_compute(quick, n, monkeypatch, c_compiler):
+    """Short work starts no thread; of long work the cases that were begun are computed again, to the same bits."""
+    started, angles = [], np.random.default_rng(SEED).uniform(-3, 3, n)
+    problems = [(pendulum(), {"a": angles, "da": 0.0}, None, (0.0, 1.0)),
+                (held_pendulum(lambda t, p: ca.sin(p.f * t)), {"a": 0.9}, {"f": angles}, (0.0, 1.0))]  # fmt: skip
+    problems[1] = (problems[1][0], problems[1][0].start(guess={"a": 0.9}), *problems[1][2:])
+    expected = [sv.simulate_many(*problem, t_eval=[0.3, 0.9]) for problem in problems]
+    most = lanes.IN_CALLER
+    monkeypatch.setattr(lanes, "IN_CALLER", quick)
+    monkeypatch.setattr(lanes, "Thread", lambda **_: started.append(1) or Thread(**_))
+    in_lanes(monkeypatch)
+    for problem, result in zip(problems, expected, strict=True):
+        same_motions(sv.simulate_many(*problem, t_eval=[0.3, 0.9], executor=3), result)
+    assert bool(started) == (quick < most and (n == 1000 or quick == 0))
 
 
 @pytest.mark.parametrize(
@@ -492,3 +511,11 @@ def test_an_executor_that_was_shut_down_is_refused():
     executor.shutdown()
     with refused(ServoError, {"cases": 2}):
         sv.simulate_many(pendulum(), {"a": [0.1, 0.2], "da": 0.0}, None, (0.0, 0.1), executor=executor)
+
+
+def test_a_disc_far_from_the_origin_rolls_as_at_it(gallery_model):
+    """Its angles have a tolerance of their own, in lanes, too."""
+    model, scene, t = gallery_model("rolling-disc"), gallery["rolling-disc"], np.linspace(0.0, 2.0, 11)
+    near, far = (sv.simulate_many(model, scene.start | {"x": x}, None, (0.0, 2.0), t_eval=t) for x in (0.0, 1e7))
+    for name in ("lean", "psi", "dphi"):
+        assert far.trace[name] == pytest.approx(near.trace[name], abs=1e-7), name

@@ -8,8 +8,10 @@ import mpmath as mp
 import numpy as np
 import pytest
 from refusals import refused
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, make_interp_spline
 
+import servoctl as sv
+from servoctl.codegen import emit
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.spec import paths
 from servoctl.spec.coordinates import coordinates
@@ -203,6 +205,58 @@ def test_a_spline_through_parameters_is_that_through_their_numbers(ends, smoothn
         path = ca.substitute(paths.spline(T, a, b, smoothness, ends), symbols, ca.DM(numbers))
         miss = np.abs(derivatives(path, smoothness)(grid) - expected).max(axis=(1, 2))
         assert np.all(miss <= most * np.abs(expected).max(axis=(1, 2)))
+
+
+@pytest.mark.parametrize("ends", ["rest", "natural"])
+@pytest.mark.parametrize("smoothness", [0, 1, 3, 5])
+@pytest.mark.parametrize("count", [9, 40])
+def test_a_spline_through_many_parameters_is_that_through_their_numbers(ends, smoothness, count):
+    rng = np.random.default_rng(count)
+    times, points = np.cumsum(10 ** rng.uniform(-0.3, 0.3, count)), rng.normal(size=(count, 2))
+    grid = np.concatenate([times, np.linspace(times[0] - 1.0, times[-1] + 1.0, 60)])
+    expected = derivatives(paths.spline(T, times, points, smoothness, ends), smoothness)(grid)
+    symbols = ca.SX.sym("points", *points.shape)
+    path = ca.substitute(paths.spline(T, times, symbols, smoothness, ends), symbols, ca.DM(points))
+    found = derivatives(path, smoothness)(grid)
+    size = np.abs(expected).max(axis=(1, 2))
+    assert np.all(np.abs(found - expected).max(axis=(1, 2)) <= 1e-10 * size)
+
+
+def test_operations_through_parameters_are_in_proportion_to_their_number():
+    def operations(n):
+        times, points = np.linspace(0.0, 6.0, n), ca.SX.sym("points", n)
+        path = paths.spline(T, times, points, 3)
+        return emit.operations(ca.Function("f", [T, ca.SX(0, 1), points], [ca.vertcat(path, ca.jtimes(path, T, 1.0))]))
+
+    few, some, many = (operations(n) for n in (50, 100, 400))
+    assert (many - some) / 300 == pytest.approx((some - few) / 50, rel=0.05)
+    assert (many - some) / 300 < 35
+
+
+def test_a_spline_through_parameters_at_very_uneven_times_is_refused():
+    times = np.cumsum(np.array([1.0, 1e-9, 1.0, 1.0, 1e-9, 1.0, 1.0, 1.0, 1e-9, 1.0]))
+    with refused(sv.SpecificationError, degree=13):
+        paths.spline(T, times, ca.SX.sym("points", len(times)), 6)
+
+
+def test_a_plan_through_twelve_parameters_pushes_as_its_spline_does():
+    q = sv.coordinates("a")
+    (a,) = q
+    names = [f"via_{k}" for k in range(12)]
+    p = sv.parameters(m=2.0, duration=6.0, **dict.fromkeys(names, 0.0))
+    law = np.linspace(0.0, 1.0, 12)
+    path = paths.spline(q.t / p.duration, law, [getattr(p, name) for name in names], 3, "natural")
+    machine = sv.Mechanism(q, gibbs=sv.particle(q, p.m, a), actuators={"F": a}, parameters=p)
+    model = sv.derive(machine, sv.Program({"X": a - path}, by="actuators"))
+    for duration in (6.0, 3.0):
+        points = np.sin(duration * law)
+        values = dict(zip(names, points, strict=True))
+        changed = model.with_parameters(duration=duration, **values)
+        run = sv.simulate(changed, changed.start(), (0.0, duration), t_eval=np.linspace(0.0, duration, 61))
+        zeros = [(order, [0.0]) for order in (3, 4)]
+        curve = make_interp_spline(duration * law, points[:, None], k=5, bc_type=(zeros, zeros))
+        np.testing.assert_allclose(run["F"], 2.0 * curve(run.t, nu=2)[:, 0], atol=1e-8)
+        assert sv.verify(changed, run).passed
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from conftest import relative
 
 import servoctl as sv
 from servoctl.codegen import compiler
+from servoctl.gallery import gallery
 from servoctl.methods.monitor import Monitor
 from servoctl.methods.taylor import series_loop
 from servoctl.model import model as models
@@ -200,8 +201,91 @@ def test_parameters_change_with_other_pivots():
 
 def test_matrices_that_are_not_definite_have_no_such_pivots():
     """A crane's residuals lie across its actuators; an arm's torques as many as residuals; a plan integrates nothing."""
-    from servoctl.gallery import gallery
-
     for name in ("overhead-crane", "vtol-centre", "spiral"):
         assert sv.derive(*gallery[name].build()).without_choice is None
     assert sv.derive(*two_links(1)).without_choice is None
+
+
+def springs(stages, order=0):
+    """Two links whose end point goes round its base, moved through springs in series: by blocks from two stages on."""
+    q = sv.coordinates(" ".join(f"{letter}{k}" for k in range(stages + 1) for letter in "ab"))
+    a, b, *others = x = list(q)
+    elbow = ca.vertcat(ca.cos(a), ca.sin(a))
+    end = elbow + ca.vertcat(ca.cos(a + b), ca.sin(a + b))
+    gibbs = sv.particle(q, 2.0, elbow) + sv.particle(q, 1.0, end) + sum(0.25 * q.dt(e, 2) ** 2 for e in others)
+    stretches = [d - c for c, d in zip(x, others, strict=False)]
+    potential = sum(100.0 * e**2 + 12.5 * e**4 for e in stretches)
+    mechanism = sv.Mechanism(q, gibbs, potential, actuators={"u": x[-2], "v": x[-1]})
+    residuals = {"X": end[0] - ca.cos(q.t) - 0.1, "Y": end[1] - ca.sin(q.t)}
+    program = sv.Program({name: q.dt(e, order) if order else e for name, e in residuals.items()})
+    return mechanism, program, {e.name(): -1.0 if e.name()[0] == "a" else 2.0 for e in x}
+
+
+@pytest.mark.parametrize(("stages", "order", "derived"), [(2, 0, 0), (1, 0, 1), (1, 1, 1)])
+def test_blocks_and_hidden_rows_change_their_pivots(stages, order, derived, counted, tmp_path):
+    """Blocks choose other pivots of the same rows; rows that divide are derived once for each choice."""
+    *specification, guess = springs(stages, order)
+    model = sv.derive(*specification)
+    if order:
+        plan = sv.derive(*springs(stages)[:2]).start(guess=guess)
+        held = dict(zip(plan.names, plan.values, strict=True))
+        start = model.start(**{name: held[name] for name in model.state_names})
+    else:
+        start = model.start(guess=guess)
+    counted["derived"] = 0
+    method = "Taylor" if order else None
+    run = sv.simulate(model, start, (0.0, 12.0), method)
+    assert counted["derived"] == derived and run.counters["pivot_changes"] >= 7
+    assert len({id(variant) for *_, variant in run.variants}) <= 4
+    assert sv.verify(model, run).passed
+    loaded = sv.load(run.save(tmp_path / "run"), model)
+    assert loaded == run and [v.place for *_, v in loaded.variants] == [v.place for *_, v in run.variants]
+    again = sv.simulate(model, start, (0.0, 12.0), method)
+    assert counted["derived"] == derived and np.array_equal(run.jets, again.jets)
+
+
+@pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
+@pytest.mark.parametrize(("name", "derived", "variants"), [("vtol-centre", 1, 3), ("steady-satellite", 3, 3)])
+def test_a_choice_of_pivots_that_returns_is_derived_once(name, derived, variants, counted):
+    scene = gallery[name]
+    model = sv.derive(*scene.build())
+    for expected in (derived, 0):
+        counted["derived"] = 0
+        run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
+        assert counted["derived"] == expected and len({id(variant) for *_, variant in run.variants}) <= variants
+        assert run.success and sv.verify(model, run).passed
+
+
+def test_other_parameters_take_over_the_pivots_of_a_start(counted):
+    """A hovering aircraft: rows that divide by the inclination of its rope are derived once, whatever its masses."""
+    scene = gallery["slung-load-3d"]
+    model, runs = sv.derive(*scene.build()), []
+    for derived, changes in ((1, {}), (0, {"m": 9.0, "J": 0.3})):
+        counted["derived"] = 0
+        other = model.with_parameters(**changes)
+        runs.append(sv.simulate(other, other.start(**scene.start, guess=scene.guess), (0.0, 0.5)))
+        assert counted["derived"] == derived and sv.verify(other, runs[-1]).passed
+    alone = pickle.loads(pickle.dumps(other))
+    again = sv.simulate(alone, alone.start(**scene.start, guess=scene.guess), (0.0, 0.5))
+    assert np.array_equal(runs[-1].jets, again.jets)
+    shorter = model.with_parameters(L=0.8)  # coordinates that are zero but for rounding have their usual sizes
+    run = sv.simulate(shorter, shorter.start(**scene.start, guess=scene.guess), (0.0, 0.5))
+    assert run.success and sv.verify(shorter, run).passed
+
+
+@pytest.mark.parametrize(("slope", "derived"), [(3.0, 0), (1.0, 0), (0.02, 1)])
+def test_a_variant_that_does_not_serve_other_parameters_is_derived_with_these(slope, derived, counted):
+    """A bead on a bar that is inclined at first: with a small slope the pivot of the variant nearly vanishes."""
+    q, p = sv.coordinates("x y"), sv.parameters(m=1.0, slope=3.0)
+    x, y = q
+    mechanism = sv.Mechanism(q, sv.particle(q, p.m, ca.vertcat(x, y)), 9.81 * p.m * y, parameters=p)
+    model = sv.derive(mechanism, sv.Program({"bar": ca.sin(x) + p.slope * y * (1.0 + x**2)}, by="ideal"))
+    jets = np.zeros(len(model.jet_names))
+    model.near(0.0, jets)
+    counted["derived"] = 0
+    other = model.with_parameters(slope=slope)
+    near = other.near(0.0, jets)
+    assert counted["derived"] == derived and near.strength(0.0, jets) > 0.3
+    assert near is other.near(0.0, -jets)  # the sign of a zero is no other place
+    rates = near.function("ode")(0.0, jets[: len(model.state_names)], near.parameters)
+    assert rates[2:4] == pytest.approx(9.81 / (1 + slope**2) * np.array([slope, -1.0]), rel=1e-12)

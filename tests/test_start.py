@@ -479,6 +479,21 @@ def test_the_rate_of_the_residual_leads_on_where_the_residual_itself_is_singular
     assert sv.verify(model, run).passed
 
 
+@pytest.mark.parametrize("curvature", [0.3, -0.1])
+def test_a_constant_curvature_is_programmed_by_its_rate(curvature):
+    """θ1 - θ2 changes by the speed times what vanishes on the circle: no velocity moves it there."""
+    mechanism, _ = trailers()
+    q = mechanism.q
+    _, _, _, first, last = q
+    error, speed = ca.tan(first - last) / 0.8 - curvature, {"speed": q.w()[0] - 1.0}
+    with refused(sv.SpecificationError, "q.dt(residual, 1)", rows=["curvature"]):
+        sv.derive(mechanism, sv.Program({"curvature": error} | speed))
+    model = sv.derive(mechanism, sv.Program({"curvature": q.dt(error)} | speed))
+    run = sv.simulate(model, model.start(theta1=np.arctan(0.8 * curvature), theta2=0.0), (0.0, 3.0))
+    assert np.tan(run["theta1"] - run["theta2"]) / 0.8 == pytest.approx(curvature, abs=1e-12)
+    assert run["theta2"] - run["theta2"][0] == pytest.approx(curvature * run.t, abs=1e-9) and sv.verify(model, run).passed
+
+
 def by_rates(speed=0.0):
     """The car along the parabola (s, s²/3), by the rates of its place."""
     mechanism = car()
@@ -492,6 +507,19 @@ def test_a_car_by_rates_of_its_place_starts_from_rest_at_the_limit_of_its_motion
     start = by_rates().start()
     assert set(start.at_rest) == {"psi", "delta"} and start.values[4:] == pytest.approx(0.0, abs=1e-12)
     assert [start["psi"], start["delta"]] == pytest.approx([0.0, np.arctan(1.1 * 2 / 3)], abs=1e-4)
+
+
+@pytest.mark.parametrize("t", [0.032, 0.05, 0.08, 3.95])
+def test_a_start_where_the_divisor_of_a_hidden_constraint_is_faint_is_refused(t):
+    """Just after rest and before it: directions that depend on squares of the speed would be rounding."""
+    model = by_rates()
+    with refused(sv.SingularProgram, "divides by", "of its usual size", rows=["X"]) as caught:
+        model.start(t)
+    later = caught.value.details["nearest_time"]
+    assert caught.value.details["size"] < 1e-6 and (later is None) == (t > 3)
+    for good in (0.1, later or 2.0):  # δ follows from the curvature of y = x²/3
+        x, delta = 3 * np.ravel(cf.rest_to_rest([good], 0, 0.0, 1.0, 4.0, 6))[0], model.start(good, x=0.0)["delta"]
+        assert delta == pytest.approx(np.arctan(1.1 * 2 / 3 / (1 + 4 * x**2 / 9) ** 1.5), abs=1e-8)
 
 
 def test_a_car_at_rest_with_given_directions_is_refused_as_it_stands_still():

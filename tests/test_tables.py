@@ -23,6 +23,7 @@ from servoctl.jets import lookup
 from servoctl.jets.pieces import by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
+from servoctl.methods.taylor import TaylorSteps, last_index, series_loop
 from servoctl.spec import paths
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
@@ -308,6 +309,26 @@ def test_a_loop_on_a_plan_with_tables_of_data_is_that_with_sums(monkeypatch):
     np.testing.assert_allclose(data["a"], sums["a"], atol=1e-11)
 
 
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 9, 10, 999, 10_001])
+def test_a_process_without_the_numbers_reads_them_from_the_function(monkeypatch, n):
+    rng = np.random.default_rng(n)
+    entries, knots = np.rint(rng.normal(size=n) * 2.0**79), np.sort(rng.normal(size=n))
+    of_entries, of_knots = lookup.Lookup.of_entries(entries), lookup.Lookup.of_knots(knots)
+    monkeypatch.setattr(lookup, "_contents", {})
+    np.testing.assert_array_equal(lookup.Lookup(of_entries.function).numbers, entries)
+    np.testing.assert_array_equal(lookup.Lookup(of_knots.function).numbers, knots)
+    s = np.concatenate([knots, np.nextafter(knots, -9.0), np.nextafter(knots, 9.0), [-1e20, 1e20]])
+    by_casadi = np.array(of_knots.function.call([ca.DM(s[None])])[0]).ravel()
+    np.testing.assert_array_equal(by_casadi, np.searchsorted(knots, s, "right"))
+
+
+def test_a_saved_table_takes_little_more_than_its_numbers():
+    def saved(n):
+        return len(pickle.dumps(lookup.Lookup.of_entries(np.arange(float(n))).function))
+
+    assert saved(40_000) - saved(20_000) < 17 * 20_000  # CasADi writes two characters for a byte
+
+
 def test_what_a_derivation_holds_does_not_depend_on_the_number_of_samples():
     def sizes(n):
         times = np.linspace(0.0, 6.0, n)
@@ -318,6 +339,20 @@ def test_what_a_derivation_holds_does_not_depend_on_the_number_of_samples():
     few, many = sizes(300), sizes(20_000)
     assert few[:2] == many[:2]
     np.testing.assert_allclose(few[2], many[2], rtol=1e-6)
+
+
+def test_steps_end_at_knots_without_a_call_for_each(monkeypatch, c_compiler):
+    knots = np.linspace(0.0, 6.0, 600)
+    model = pendulum_cart(lambda t: sv.paths.spline(t, knots, np.sin(knots), 3, "natural"))
+    library, ends = series_loop(model, last_index(model, sv.Taylor()))._library, []
+    steps = library.taylor
+    monkeypatch.setattr(library, "taylor", lambda *given: ends.append(steps(*given)[1:, 0]) or steps(*given))
+    start = model.start(theta=0.1, dtheta=0.0)
+    run = sv.simulate(model, start, (0.0, 6.0), "Taylor", t_eval=np.linspace(0.0, 6.0, 61))
+    assert np.isin(knots[1:], np.concatenate(ends)).all()
+    assert len(ends) <= 1 + run.counters["steps"] // TaylorSteps.most
+    assert sv.verify(model, run).passed
+
 
 
 def test_an_exported_plan_holds_its_tables_of_data(monkeypatch, tmp_path, c_compiler):

@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import make_interp_spline
 
 import servoctl as sv
 from servoctl.codegen.interpreted import rough_log2
@@ -38,16 +39,20 @@ def oscillator():
     return sv.derive(mechanism, sv.Program({"held": y}, by="ideal"), keep=["x"])
 
 
+@pytest.mark.parametrize("unlike", [False, True])
 @pytest.mark.parametrize("name", ["appell-hamel", "wheeled-robot"])
 @pytest.mark.parametrize("span", [(0.0, 0.5), (0.5, 0.0)])
-def test_compiled_and_interpreted_steps_are_the_same(name, span, gallery_model, c_compiler):
+def test_compiled_and_interpreted_steps_are_the_same(name, span, unlike, gallery_model, c_compiler):
     scene, model = gallery[name], gallery_model(name)
     start = model.start(t=span[0], **scene.start, guess=scene.guess)
     f, top = series_loop(model, 11), model.reduction.top
     p = np.append(model.parameters, 0.25)
-    log = f.taylor(span[0], start.values, span[1], p, 1e-7, 1e-9, 100)
+    atol = np.geomspace(1e-9, 1e-13, len(start.values)) if unlike else 1e-9
+    log = f.taylor(span[0], start.values, span[1], p, 1e-7, atol, 100)
     f._place(f._interpreter, span[0], start.values, p)
-    again = f._interpreter.taylor(span[1], 1e-7, 1e-9, 0, 100)
+    weights = atol.min() / atol if unlike else None
+    ends = np.array([span[1]])
+    again = f._interpreter.taylor(ends, 1e-7, atol.min() if unlike else atol, 0, 100, weights)
     n_x = len(start.values)
     np.testing.assert_allclose(again[:, : 1 + n_x], log[:, : 1 + n_x], rtol=1e-11, atol=1e-11)
     t = np.linspace(*span, 41)
@@ -236,3 +241,67 @@ def test_matrices_have_the_velocities_that_rows_determine(span):
     moved[f.sizes["nq"] :] += 0.1 * (1 - np.array(f.sizes["free"]))
     assert f(span[0], moved, p) == pytest.approx(f(span[0], state, p), rel=1e-13, abs=1e-13)
     assert f.others["settled"](span[0], moved, p) == pytest.approx(f.others["settled"](span[0], state, p))
+
+
+@pytest.mark.parametrize("forward", [True, False])
+@pytest.mark.parametrize("natural", [True, False])
+def test_one_call_over_many_knots_has_the_bits_of_a_call_for_each_piece(forward, natural, c_compiler):
+    q = sv.coordinates("x theta")
+    x, theta = q
+    bob = (x + ca.sin(theta), -ca.cos(theta))
+    gibbs = sv.particle(q, 2.0, (x, 0.0)) + sv.particle(q, 0.5, bob)
+    machine = sv.Mechanism(q, gibbs=gibbs, potential=4.9 * bob[1], actuators={"F": x})
+    knots = np.linspace(0.0, 6.0, 60 if natural else 300)  # coefficients in sums, and in tables
+    path = sv.paths.spline(q.t, knots, np.sin(knots), 3, "natural" if natural else "rest")
+    model = sv.derive(machine, sv.Program({"X": x - path}, by="actuators"))
+    ends = knots[(knots > 1.0) & (knots < 4.0)].tolist()
+    ends = [*ends, 4.0] if forward else [*ends[::-1], 1.0]
+    t = first = 1.0 if forward else 4.0
+    start, f, top = model.start(t=first, theta=0.1, dtheta=0.0).values, series_loop(model, 11), model.reduction.top
+    p, state, rows = np.append(model.parameters, np.nan), start, []
+    for end in ends:
+        piece = f.taylor(t, state, end, p, 1e-8, 1e-9, 100)
+        rows, t, state = [*rows, *piece[:-1]], end, piece[-1, 1 : 1 + start.size]
+    at_once = f.taylor(first, start, ends, p, 1e-8, 1e-9, 10_000)
+    np.testing.assert_array_equal(at_once[:-1], rows)
+    np.testing.assert_array_equal(at_once[-1, : 1 + start.size], [t, *state])
+    f._place(f._interpreter, first, start, p)
+    again = f._interpreter.taylor(np.array(ends), 1e-8, 1e-9, 0, 10_000)
+    np.testing.assert_allclose(again[:, : 1 + start.size], at_once[:, : 1 + start.size], rtol=1e-10, atol=1e-10)
+    k = np.arange(len(rows))
+    middle = (at_once[1:, 0] + at_once[:-1, 0]) / 2
+    expected = f.jets(at_once, k, middle, p, top, by_rows=True)
+    compared = np.empty_like(expected)
+    f._interpreter.jets(at_once, k, middle, p, (top, start.size + model.n), compared)
+    np.testing.assert_allclose(compared, expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("samples", [30, 300])
+@pytest.mark.parametrize("span", [(0.0, 6.0), (5.9, 0.3)])
+def test_a_robot_that_turns_at_measured_rates_has_their_integral(samples, span, c_compiler):
+    """Velocities that rows determine, on both sides of knots: theta' is the spline, and theta its antiderivative."""
+    q = sv.coordinates("x y theta")
+    (x, y, theta), (dx, dy, dtheta) = q, q.d(1)
+    times = np.linspace(0.0, 6.0, samples)
+    rates = 0.4 * np.sin(2.0 * times) + 0.2
+    turn = sv.paths.spline(q.t, times, rates, 3, "natural")
+    S = sv.particle(q, 2.0, (x, y)) + 0.3 * q.d(2)[2] ** 2 / 2
+    wheel = {"wheel": dy * ca.cos(theta) - dx * ca.sin(theta)}
+    program = {"speed": dx * ca.cos(theta) + dy * ca.sin(theta) - 1.0, "turn": dtheta - turn}
+    model = sv.derive(sv.Mechanism(q, gibbs=S, constraints=wheel), sv.Program(program, by="ideal"))
+    start = model.start(t=span[0], x=0.0, y=0.0, theta=0.1)
+    t_eval = np.unique(np.concatenate([np.linspace(*sorted(span), 41), times[(times > 0.3) & (times < 5.9)]]))
+    run = sv.simulate(model, start, span, sv.Taylor(rtol=1e-10), t_eval=t_eval[:: 1 if span[0] < span[1] else -1])
+    curve = make_interp_spline(times, rates[:, None], k=5, bc_type=([(3, [0.0]), (4, [0.0])],) * 2)
+    angle = curve.antiderivative()
+    heading = 0.1 + angle(run.t)[:, 0] - angle(span[0])[0]
+    assert run.status == 0 and sv.verify(model, run).passed
+    np.testing.assert_allclose(run["theta"], heading, atol=1e-9)
+    np.testing.assert_allclose(run["dtheta"], curve(run.t)[:, 0], atol=1e-12)
+    np.testing.assert_allclose(run["dx"], np.cos(heading), atol=1e-9)
+    np.testing.assert_allclose(run["d2theta"], curve(run.t, nu=1)[:, 0], atol=1e-10)
+    middle = float(heading.min() + heading.max()) / 2
+    ends = sv.Event("theta", middle, terminal=True)
+    ended = sv.simulate(model, start, span, sv.Taylor(rtol=1e-10), events=ends)
+    reached = 0.1 + angle(ended.t[-1])[0] - angle(span[0])[0]
+    assert ended["theta"][-1] == pytest.approx(middle, abs=1e-9) and reached == pytest.approx(middle, abs=1e-9)

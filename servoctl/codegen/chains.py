@@ -20,6 +20,8 @@ CYCLES = defaultdict(lambda: 40, {  # of today's processors, from the last opera
 })  # fmt: skip
 AHEAD = 60  # cycles: about one stage, by which coordinates are known before velocities, which are their rates
 FACTORS = 8  # of one product, at most
+WAITING = 0.3  # operations in a cycle of the longest chain: the processor works ahead, but not all the time
+RECIPROCAL = 2  # operations that take as long as the unit for divisions is occupied
 
 _FACTORS_OF = {ca.OP_SQ: lambda a: (a, a), ca.OP_TWICE: lambda a: (Constant(2.0), a), ca.OP_MUL: lambda a, b: (a, b)}
 _SIGNS = {ca.OP_ADD: (1.0, 1.0), ca.OP_SUB: (1.0, -1.0), ca.OP_NEG: (-1.0,)}
@@ -45,6 +47,27 @@ def short_chains(statements):
     return chains.needed()
 
 
+def time_of(statements):
+    """The time of statements, in operations: their number, and a share of the cycles that the last rate waits for."""
+    known, late = {}, _late(statements)
+    for target, operation, operands in statements:
+        begun = max((known[v] if isinstance(v, int) else _known_at(v, late) for v in operands), default=0)
+        known[target] = begun + (CYCLES[operation] if isinstance(target, int) else 0)
+    operations = [operation for target, operation, _ in statements if isinstance(target, int)]
+    return len(operations) + (RECIPROCAL - 1) * operations.count(ca.OP_INV) + WAITING * max(known.values(), default=0)
+
+
+def _late(statements):
+    """The entries of x whose rates are computed."""
+    rates = (target for target, _, operands in statements if isinstance(target, str) and operand_values(operands))
+    return {"x" + target[1:] for target in rates}
+
+
+def _known_at(operand, late):
+    """The time [cycles] at which an input or a constant is known."""
+    return 0 if operand in late else -AHEAD
+
+
 class _Chains:
     """The statements written so far.
 
@@ -57,14 +80,11 @@ class _Chains:
         self.statements, self.written, self.known, self.place = [], {}, {}, {}
         self.factors, self.terms, self.circular, self.read_once = {}, {}, {}, set()
         self.reads = Counter(v for _, _, operands in statements for v in operand_values(operands))
-        rates = {target for target, _, operands in statements if isinstance(target, str) and operand_values(operands)}
-        self.late = {"x" + target[1:] for target in rates}  # the entries of x whose rates are computed
+        self.late = _late(statements)
 
     def at(self, v):
         """The time at which an operand is known."""
-        if isinstance(v, int):
-            return self.known[v]
-        return 0 if v in self.late else -AHEAD
+        return self.known[v] if isinstance(v, int) else _known_at(v, self.late)
 
     def take(self, target, operation, operands):
         """Write what replaces a given statement."""

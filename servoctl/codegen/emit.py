@@ -13,9 +13,11 @@ from itertools import chain, count
 
 import casadi as ca
 
-from servoctl.codegen.chains import short_chains
+from servoctl.codegen.chains import short_chains, time_of
+from servoctl.codegen.collecting import ways
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
 from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
+from servoctl.jets.branches import apply_code
 from servoctl.jets.lookup import lookup_at, lookups
 from servoctl.jets.pieces import Constant
 
@@ -85,6 +87,8 @@ class Dialect:
         Whether the text holds the numbers of large tables; otherwise they are set when its library is loaded.
     chained : bool
         Whether each evaluation waits for the one before: the statements of one chunk are those of `short_chains`.
+    collected : bool
+        Whether like terms of these are collected before.
     """
 
     number: str = "double"
@@ -96,6 +100,7 @@ class Dialect:
     exact: bool = False
     whole: bool = False
     chained: bool = False
+    collected: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -132,7 +137,7 @@ class Dialect:
 SCALAR = Dialect(forms=_FORMS_OF_ONE)
 EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
-SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True)
+SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True, collected=True)
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
 EXPORTED = replace(PORTABLE, whole=True)
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
@@ -144,6 +149,41 @@ LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 def operations(f):
     """Number of arithmetic operations of an SX function in C: all but constants, inputs, outputs and copies."""
     return sum(isinstance(target, int) for target, _, _ in tabulated(_statements(f, SCALAR))[0])
+
+
+def cost(f, dialect):
+    """The time of a function in a dialect, in operations; see `time_of`."""
+    return time_of(_prepared(f, dialect)[0])
+
+
+def other_ways(f):
+    """Outputs equal to that of a short SX function (t, x, p) but for rounding, with like terms collected."""
+    statements = _statements(f, SCALAR)
+    lookups = any(not isinstance(operation, int) for _, operation, _ in statements)
+    if lookups or len(statements) > CHUNK:
+        return []
+    inputs = dict(zip("txp", f.sx_in(), strict=True))
+    return [_of_statements(way, inputs) for way in ways(statements)[1:]]
+
+
+def _of_statements(statements, inputs):
+    """The outputs of statements as an SX column; `inputs` by name."""
+    values, outputs = {}, []
+
+    def operand(v):
+        if isinstance(v, str):
+            name, _, index = v.rstrip("]").partition("[")
+            return inputs[name][int(index or 0)]
+        return ca.SX(v.value) if isinstance(v, Constant) else values[v]
+
+    for target, operation, operands in statements:
+        if isinstance(target, str):
+            outputs.append(operand(operands[0]))
+        else:
+            value = apply_code(operation, *map(operand, operands))
+            # CasADi would divide by c for a product with 1/c, which then were no value of its own
+            values[target] = ca.copysign(value, value) if operation == ca.OP_INV else value
+    return ca.vertcat(*outputs)
 
 
 def _copies(operation, source):
@@ -279,7 +319,8 @@ def _prepared(f, dialect, suffix=""):
     header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
     if not dialect.exact:
         chained = dialect.chained and len(statements) <= CHUNK
-        statements = short_chains(statements) if chained else _with_reciprocals(statements)
+        some = ways(statements) if chained and dialect.collected else [statements]
+        statements = min(map(short_chains, some), key=time_of) if chained else _with_reciprocals(statements)
     return statements, [*header, *tables]
 
 

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.interpreted import Interpreter, restored, restored_grid
+from servoctl.codegen.interpreted import Interpreter, restored, restored_grid, weighted
 from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library, builtin
 from servoctl.codegen.tables import BOUND
@@ -390,21 +390,25 @@ class Compiled:
         n, iterations = self._library.newton(t, nodes, p, x, y)
         return x[:, :n], y[:, :n], iterations
 
-    def taylor(self, t0, x0, t1, p, rtol, atol, max_steps, project_every=0):
+    def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then pivots.
 
         A step is as long as its last term meets the tolerance at every level of the state.
 
         Parameters
         ----------
-        t0, t1 : float
-            Start and end [s].
+        t0 : float
+            Start [s].
         x0 : (n_x,) array
             State at t0, SI.
+        ends : float or (N,) array
+            Instants at which a step ends, in the direction of motion, the last one the end [s]. Between two of them
+            paths have one branch.
         p : (n_p,) array
-            Parameters, SI.
+            Parameters, SI. The last one, the instant that selects the branches of paths, is set for each step.
         rtol, atol : float
-            Tolerances of each level of the state: relative to its largest entry, and absolute.
+            Tolerances of each level of the state: relative to its largest entry, and absolute. With atol (n_x,), of a
+            level each of whose entries is measured in its own absolute tolerance.
         max_steps : int
             Largest number of steps.
         project_every : int
@@ -413,8 +417,8 @@ class Compiled:
         Returns
         -------
         (S + 1, 1 + n_x + n_y) array
-            t, x and outputs at the starts of the S steps, and t and x at the end of the last one, which lies before t1
-            if the step length vanishes.
+            t, x and outputs at the starts of the S steps, and t and x at the end of the last one, which lies before the
+            last end if the step length vanishes.
 
         Raises
         ------
@@ -424,7 +428,8 @@ class Compiled:
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        return self._library.taylor(t1, rtol, atol, every, max_steps)
+        ends, (atol, weights) = np.atleast_1d(np.asarray(ends, dtype=float)), weighted(atol)
+        return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
 
     def jets(self, log, k, t, p, levels, by_rows=False):
         """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.
@@ -438,7 +443,7 @@ class Compiled:
         t : (N,) array
             Times [s].
         p : (n_p,) array
-            Parameters, SI.
+            Parameters, SI; those of `taylor`.
         levels : int
             Below ``sizes["last"]``.
         by_rows : bool

@@ -40,7 +40,7 @@ class Workspace(threading.local):
         run, self._alive = connect(row, parts)
         self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
         self.start, self._log = row[: 1 + n_x + n_p], np.empty((0, 0))
-        self._task = np.zeros(7)  # the Steps of taylor.c: five numbers, and the addresses of the start and the log
+        self._task = np.zeros(9)  # the Steps of taylor.c: five numbers; addresses of start, log, ends, weights
         self._task.view(np.int64)[5] = row.ctypes.data
         self.task, self.pointer = memoryview(self._task), ctypes.c_void_p(self._task.ctypes.data)
 
@@ -50,6 +50,14 @@ class Workspace(threading.local):
             self._log = np.empty((rows, columns))
             self._task.view(np.int64)[6] = self._log.ctypes.data
         return self._log
+
+    def until(self, ends):
+        """Set the ends (N,) of the steps; their array must live as long as the call."""
+        self._task[0], self._task.view(np.int64)[7] = len(ends), ends.ctypes.data
+
+    def weigh(self, weights):
+        """Set the weights of the Taylor method, None for 1; they must live as long as the call."""
+        self._task.view(np.int64)[8] = 0 if weights is None else weights.ctypes.data
 
 
 class Blocks(threading.local):
@@ -178,33 +186,38 @@ class Interpreter:
         return column - 1
 
     @np.errstate(all="ignore")
-    def taylor(self, t1, rtol, atol, every, max_steps):
+    def taylor(self, ends, rtol, atol, every, max_steps, weights=None):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
         start, n_x = self.workspace.start.copy(), self._n_x
-        t, x, p, rows = start[0], start[1 : 1 + n_x], start[1 + n_x :], []
+        t, x, p, rows, (t1, *later) = start[0], start[1 : 1 + n_x], start[1 + n_x :], [], ends
+        p[-1] = (t + t1) / 2
         free = np.array(self._sizes.get("free", [1] * (n_x - nq)), dtype=bool).reshape(top - 1, n)
+        w = np.ones(n_x) if weights is None else weights
         while True:
-            if len(rows) == max_steps or t == t1:
+            if len(rows) == max_steps or t == ends[-1]:
                 x = self._settle(t, x, p)
                 break
+            if t == t1:
+                t1, *later = later
+                p[-1] = (t + t1) / 2
             y = self._value(t, x, p)
             of_q = y[: nq * last].reshape(last, nq)
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
-            levels = zip(x[nq:].reshape(top - 1, n), free, strict=True)
-            of_rates = (longest(level[i], c[:, i], j, rtol, atol) for j, (level, i) in enumerate(levels, 1))
-            h = rough_exp2(min(longest(x[:nq], of_q, 0, rtol, atol), *of_rates))
+            levels = zip(*(part[nq:].reshape(top - 1, n) for part in (x, w)), free, strict=True)
+            of_rates = (longest((u * v)[i], (u * c)[:, i], j, rtol, atol) for j, (v, u, i) in enumerate(levels, 1))
+            h = rough_exp2(min(longest(w[:nq] * x[:nq], w[:nq] * of_q, 0, rtol, atol), *of_rates))
             if not h > 1e-13 * (1 + abs(t)):
                 x = self._settle(t, x, p)
                 break
             x[nq:][~free.ravel()] = np.concatenate([jet(c, j, 0.0) for j in range(1, top)])[~free.ravel()]
-            ends = h >= abs(t1 - t) * (1 - 1e-12)
-            h = t1 - t if ends else np.copysign(h, t1 - t)
+            reached = h >= abs(t1 - t) * (1 - 1e-12)
+            h = t1 - t if reached else np.copysign(h, t1 - t)
             following = np.concatenate([x[:nq] + jet(of_q, 0, h), *(jet(c, j, h) for j in range(1, top))])
             if not np.isfinite(following).all():
                 break
             rows.append(np.concatenate([[t], x, y]))
-            t, x = t1 if ends else t + h, following
+            t, x = t1 if reached else t + h, following
             if every and len(rows) % every == 0:
                 x = self._restore(t, self._settle(t, x, p), p)
         return np.array([*rows, np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])])
@@ -221,9 +234,9 @@ class Interpreter:
         for j in range(1, levels + 1):
             z[nq + (j - 1) * n : nq + j * n] = jet(c, j, h).T
         if settled and self._settled is not None:
-            rows = np.empty((self._settled.numel_out(0), t.size))
-            self._settling.grid(t, z[: self._n_x], p, rows)
-            z[:settled] = rows[:settled]
+            for i, (when, x) in enumerate(zip(t, z[: self._n_x].T.copy(), strict=True)):
+                branch = (log[k[i], 0] + log[k[i] + 1, 0]) / 2
+                z[:settled, i] = self._settling._value(when, x, np.append(p[:-1], branch))[:settled]
 
     @functools.cached_property
     def _settling(self):
@@ -329,6 +342,13 @@ def rough_exp2(a):
     """Its inverse, as in taylor.c."""
     whole, f = divmod(min(max(a, -1022.0), REST), 1.0)
     return ldexp(1.0 + f * (1.0 - BEND + BEND * f), int(whole))
+
+
+def weighted(atol):
+    """The least absolute tolerance and weights (n_x,) by which each entry has this one; None for a number."""
+    if np.ndim(atol) == 0:
+        return atol, None
+    return atol.min(), atol.min() / atol
 
 
 def longest(level, c, j, rtol, atol):

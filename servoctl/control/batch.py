@@ -71,19 +71,10 @@ def _derived(plant, law, disturbed, residuals):
     n_c, n_u, project = len(plant.parameters), len(plant.inputs), plant.equations.project()
     t, x, p, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], *(p[i] for i in disturbed))
-    rates, w, w_values = _apart(rates, ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed)))
+    still = ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed))
+    f, w, w_values = _fastest((t, x, p, rates), still, applied)
     t_k, row, written, common_values = _law_in_c(law)
-    phi = ca.SX(0, 1)
-    if residuals:
-        places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
-        # a single parameter indexed by [] is a row in CasADi, not a column
-        numbers = ca.vertcat(ca.SX(0, 1), *(constants[i] for i in places))
-        phi = residuals.expression(t_k, x, plant.state_names, numbers)
-    entries = plant.equations.dropped
-    if entries is not None:
-        values, sizes = ca.vertsplit(ca.fabs(entries.expression(t_k, x, p)), entries.n_y // 2)
-        phi = ca.vertcat(phi, ca.mmax(ca.if_else(sizes > 0, values / sizes, 0)))
-    phi, s, s_values = _apart(phi, t_k)
+    phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p), t_k)
     phi, v, v_values = _apart(phi, constants)
     sizes = {
         "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
@@ -98,16 +89,30 @@ def _derived(plant, law, disturbed, residuals):
         emit.unit(sizes | texts),
         emit.include("normal.h"),
         _lanes("numbers", t, constants, ca.SX(0, 1), ca.vertcat(w_values, v_values)),
-        _rates_of_block(_function("rates", t, x, ca.vertcat(w, applied), rates)),
+        _rates_of_block(f),
         written,
         _lanes("signals", t_k, ca.vertcat(x, v), s, phi, emit.LANES_COMMON),
         "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
         emit.include("batch.c"),
     ]
     table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
-    text, watched = "".join(parts), int(entries is not None)
+    text, watched = "".join(parts), int(plant.equations.dropped is not None)
     table = compiled(table, "table")
     return Unit(text, table, plant.state_names, plant.inputs, residuals, len(law.measures), watched)
+
+
+def _signals(plant, residuals, t, x, p):
+    """Residuals, and the largest share of its terms that an entry left out by eliminations has."""
+    phi, entries = ca.SX(0, 1), plant.equations.dropped
+    if residuals:
+        places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
+        # a single parameter indexed by [] is a row in CasADi, not a column
+        numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in places))
+        phi = residuals.expression(t, x, plant.state_names, numbers)
+    if entries is not None:
+        values, sizes = ca.vertsplit(ca.fabs(entries.expression(t, x, p)), entries.n_y // 2)
+        phi = ca.vertcat(phi, ca.mmax(ca.if_else(sizes > 0, values / sizes, 0)))
+    return phi
 
 
 def _law_in_c(law):
@@ -127,6 +132,19 @@ def _rates(plant, disturbed):
     first = len(plant.parameters) + len(plant.inputs)
     calm = [i for i in range(first, p.numel()) if i not in disturbed]
     return t, x, p, ca.substitute(f(t, x, p), p[calm], ca.SX.zeros(len(calm)))
+
+
+def _fastest(of_all, still, applied):
+    """The rates (t, x, p, x') as a function of (t, x, [w; applied]), symbols w, and their values by symbols `still`.
+
+    What each case computes once takes no time.
+    """
+    f, (t, x, p, _) = _function("rates", *of_all), of_all
+    ways = []
+    for rates in (f(t, x, p), *(ca.Function("way", f.sx_in(), [way])(t, x, p) for way in emit.other_ways(f))):
+        rest, w, values = _apart(rates, still)
+        ways.append((_function("rates", t, x, ca.vertcat(w, applied), rest), w, values))
+    return min(ways, key=lambda way: emit.cost(way[0], emit.LANES_INLINE))
 
 
 def _apart(expression, symbols):

@@ -94,9 +94,9 @@ def close(
 
 def regular_at_start(plant, t0, x0):
     """The plant, with pivots decided near the start of a loop if those decided elsewhere vanish there."""
-    rest = np.zeros(len(plant.inputs))
     if not plant.constrained:
         return plant
+    rest = np.zeros(len(plant.inputs))
     x = _initial_state(plant, t0, x0, rest)
     return plant if np.isfinite(plant.rates(t0, x, rest)).all() else plant.near(t0, x)
 
@@ -104,6 +104,8 @@ def regular_at_start(plant, t0, x0):
 def _derived_along(run):
     """The instant at which an entry that eliminations left out comes alive, and equations derived near it; or None."""
     plant, equations, t, x = run.plant, run.plant.equations, run.t, run.states
+    if equations.dropped is None:
+        return None, None
     values = plant.parameters[: len(equations.values)]
 
     def entries(some):
@@ -145,7 +147,8 @@ def loop_of(plant, law, x0, t_span, conditions):
         measured=np.array([plant.state_names.index(name) for name in law.measures], dtype=np.int64),
         disturbed=disturbed, initial_input=initial,
         disturbance=conditions.forces(t0, law.period / substeps, samples * substeps),
-        noise=sensors.noisy(law.measures, samples + 1), quantum=sensors.quantum(law.measures),
+        noise=sensors.noisy(law.measures, samples + 1) if sensors.noise else None,
+        quantum=sensors.quantum(law.measures) if sensors.quantisation else None,
         low=low, high=high, change=change, transport=transport,
     )  # fmt: skip
 
@@ -162,11 +165,10 @@ def _initial_input(law, t0):
 def _initial_state(plant, t0, x0, initial_input):
     """The initial state; lagged inputs that were left out are at rest, material constraints must hold."""
     x = plant.state(x0)
-    at_rest = dict(zip(plant.inputs, initial_input, strict=True))
-    x = np.array(
-        [at_rest[name] if np.isnan(value) else value for name, value in zip(plant.state_names, x, strict=True)]
-    )
-    require_consistent(plant, t0, x[:, None], plant.p()[:, None])
+    for i, name in enumerate(plant.lagged, len(x) - len(plant.lag)):
+        x[i] = initial_input[plant.inputs.index(name)] if np.isnan(x[i]) else x[i]
+    if plant.constrained:
+        require_consistent(plant, t0, x[:, None], plant.p()[:, None])
     return x
 
 
@@ -195,7 +197,9 @@ def finished(plant, law, plan, loop, conditions, advance=None):
     status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop, advance)
     if status == INTERRUPTED and not len(x):
         raise KeyboardInterrupt
-    t = loop.t0 + np.arange(len(x)) * loop.period
+    t = np.arange(len(x), dtype=float)
+    t *= loop.period
+    t += loop.t0
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.state)
     end = loop.t0 + len(x) * loop.period
     message = {

@@ -190,6 +190,8 @@ def ranges(plant, period):
 
 def limits(plant, period):
     """The same three arrays; None for limits or rate limits that the plant does not have."""
+    if not plant.limits and not plant.rate_limits:
+        return None, None, None
     low, high, change = ranges(plant, period)
     low, high = (low, high) if plant.limits else (None, None)
     return low, high, change if plant.rate_limits else None
@@ -213,6 +215,8 @@ def require_few_steps(samples, substeps, operations):
 
 def steps(plant, period, substeps, t0, x0, u0):
     """Integration steps per sample, and transport delays in such steps, (m,) integers or None without any."""
+    if substeps is not None and not plant.delay:
+        return substeps, None
     delays = np.array([plant.delay.get(name, 0.0) for name in plant.inputs])
     if substeps is None:
         least = _resolving(plant, period, t0, x0, u0)

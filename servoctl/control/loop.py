@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servoctl.codegen.native import pointer
 from servoctl.errors import ServoError
 from servoctl.values import Value
 
@@ -49,12 +48,15 @@ class Loop(Value):
 
 _FIELDS = {
     ctypes.c_int64: "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u depth every n_traced columns "
-    "stop status sample step steps",
+    "stop status sample step steps stride",
     ctypes.c_double: "t0 period",
     ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale "
     "deviations measured transport disturbed traced keys state x law_x law_y input gathered trace law",
 }
-_KINDS = dict.fromkeys(("measured", "transport", "disturbed", "traced"), np.int64) | {"keys": np.uint64}
+_TYPES = {np.float64, np.int64, np.uint64}  # of numbers in arrays
+_KIND_OF = {name: kind for kind, names in _FIELDS.items() for name in names.split()}
+_KIND_OF |= dict.fromkeys((n for n, kind in _KIND_OF.items() if kind is ctypes.c_void_p and n != "law"), np.float64)
+_KIND_OF |= dict.fromkeys(("measured", "transport", "disturbed", "traced"), np.int64) | {"keys": np.uint64}
 
 
 class Arguments(ctypes.Structure):
@@ -69,13 +71,13 @@ class Arguments(ctypes.Structure):
     def __init__(self, **values):
         super().__init__()
         self.arrays = []
-        for name, kind in self._fields_:
-            value = values.get(name)
-            if value is None:
+        for name, value in values.items():
+            kind = _KIND_OF.get(name)
+            if value is None or kind is None:
                 continue
-            if kind is ctypes.c_void_p and not isinstance(value, ctypes.c_void_p):
-                self.arrays.append(np.ascontiguousarray(value, dtype=_KINDS.get(name, np.float64)))
-                value = pointer(self.arrays[-1])
+            if kind in _TYPES and not isinstance(value, ctypes.c_void_p):
+                self.arrays.append(np.ascontiguousarray(value, dtype=kind))
+                value = self.arrays[-1].ctypes.data
             setattr(self, name, value)
 
 
@@ -94,16 +96,26 @@ def run_loop(ode, law, loop, advance=None):
     (N, n_u).
     """
     n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
+    native = ode.native("closed") if advance is None else None
+    exact = native is not None and not n_z and loop.noise is None and loop.quantum is None  # the law gets states
     logs = {
-        "x": np.empty((n, ode.n_x)), "law_x": np.empty((n + 1, n_y + n_z)),
+        "x": np.empty((n, ode.n_x)), "law_x": np.empty((1 if exact else n + 1, n_y + n_z)),
         "law_y": np.empty((n, loop.n_out)), "input": np.empty((n, loop.n_u)),
     }  # fmt: skip
-    native = ode.native("closed") if advance is None else None
     if native is None:
         done, status = _interpreted(ode, law, loop, advance or hold, logs)
     else:
         done, status = _native(native, law, loop, logs)
+    if exact:
+        logs["law_x"] = _measured_columns(logs["x"], loop.measured)
     return status, *(log[:done] for log in logs.values())
+
+
+def _measured_columns(x, indices):
+    """Columns of x (N, n_x), without a copy if they are next to each other."""
+    some = indices.tolist()
+    adjoining = some and some == [*range(some[0], some[0] + len(some))]
+    return x[:, some[0] : some[0] + len(some)] if adjoining else x[:, some]
 
 
 def _native(native, law, loop, logs):
@@ -115,6 +127,7 @@ def _native(native, law, loop, logs):
         step = _STEP(_called_back(law, loop, logs["law_x"].shape[1], failures))
     rows, n_row = loop.table.shape
     sizes = {"n_y": len(loop.measured), "n_z": len(loop.z0), "n_d": len(loop.disturbed), "rows": rows, "n_row": n_row}
+    sizes["stride"] = logs["law_x"].shape[1] if len(logs["law_x"]) > 1 else 0
     goes_on = {"state": loop.x0.copy(), "steps": FIRST_PIECE, "status": PAUSED}
     arguments = Arguments(**vars(loop) | sizes | logs | goes_on)
     native.restype = ctypes.c_int64
@@ -133,8 +146,9 @@ def _native(native, law, loop, logs):
 
 def _raised(law, loop, k, law_x):
     """The error that a law in C raises in Python at sample k; None if it does not raise."""
+    x, row = law_x[min(k, len(law_x) - 1)], loop.table[min(loop.first + k, len(loop.table) - 1)]
     try:
-        law(loop.t0 + k * loop.period, law_x[k].copy(), loop.table[min(loop.first + k, len(loop.table) - 1)])
+        law(loop.t0 + k * loop.period, x.copy(), row)
     except ServoError as error:
         return error
 

@@ -7,6 +7,7 @@ whose derivative is zero, so that CasADi differentiates expressions of them as t
 
 import functools
 import hashlib
+import math
 import re
 
 import casadi as ca
@@ -147,5 +148,15 @@ def _line(knots, values):
 
 
 def _list(numbers):
-    """The function of a place that is an entry of a list at whole numbers."""
-    return _line(np.arange(len(numbers), dtype=float).tolist(), numbers.tolist())
+    """The function of a place that is an entry of a list at whole numbers.
+
+    The list is folded to rows, by straight lines in two directions: a grid of all places would take as much again.
+    """
+    width = 2 + math.isqrt(len(numbers))
+    rows = 2 + len(numbers) // width
+    grids = [np.concatenate([[0.0], np.arange(float(n)), [n - 1.0]]).tolist() for n in (width, rows)]
+    values = np.append(numbers, np.zeros(width * rows - len(numbers)))
+    folded = ca.Function.bspline("list", grids, values, [1, 1], 1, {})
+    place = ca.MX.sym("place")
+    row = ca.floor(place / width)
+    return ca.Function("entry", [place], [folded(ca.vertcat(place - width * row, row))])

@@ -21,6 +21,8 @@ from servoctl.methods.taylor import order_for
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
 MARGIN, FINER = 0.1, 1e-2  # first tolerance relative to the accuracy, and each next one relative to the last
 ATOL = 1e-11  # default absolute tolerance, for motions whose sizes are neither far below nor far above 1
+AT_REST = 1e-10  # of the size that the inertia gives an entry: less is rounding
+UNLIKE = 3e-3  # of the largest of its level: a smaller entry has a tolerance of its own
 COARSE = 10.0  # times rtol: an absolute tolerance above this part of a size decides about its error
 LARGE = 1e3  # size above which the default absolute tolerance comes near rounding and grows with the size
 FINEST = 1e-15  # tolerance below which steps shorten and rounding grows
@@ -81,22 +83,46 @@ def coarse(sizes, rtol):
     return (sizes > 0) & (ATOL > COARSE * rtol * sizes)
 
 
-def absolute_tolerances(model, t, x, rtol):
-    """Absolute tolerances (n_x,) for a motion of which the default is no small part; None where it is.
-
-    Parameters
-    ----------
-    model : Model
-    t : (N,) array
-        [s]
-    x : (n_x, N) array
-    rtol : float
-    """
-    sizes = motion_sizes(model, t, x)
+def absolute_tolerances(sizes, rtol):
+    """Absolute tolerances (n_x,) for a motion of sizes (n_x,) where the default is no small part of them; else None."""
     moves = sizes > 0
     if not coarse(sizes, rtol).any():
         return None
     return np.where(moves, np.minimum(ATOL, FINER * rtol * sizes), ATOL)
+
+
+def unlike_tolerances(levels, largest, sizes, atol=None):
+    """Absolute tolerances (n_x,) for entries of a level that are too unlike for one of the level; else None.
+
+    As places in micrometres beside angles. What the inertia makes of an entry tells a small one from rounding.
+
+    Parameters
+    ----------
+    levels : (n_x,) array of int
+        From `state_levels`.
+    largest : (n_x,) array
+        Magnitudes of the entries along the motion.
+    sizes : (n_x,) array
+        The same in the metric of the inertia, from `sizes_of`.
+    atol : float, optional
+        The tolerance of the largest entries of each level. Default: 1e-11 of each entry.
+    """
+    if not unlike(levels, largest, sizes):
+        return None
+    own = np.where(largest >= AT_REST * sizes, largest, sizes)
+    own[own == 0.0] = 1.0
+    return ATOL * own if atol is None else atol * np.minimum(own / np.fmax(_of_level(levels, largest), own), 1.0)
+
+
+def unlike(levels, largest, sizes=0.0):
+    """Whether an entry of (n_x, ...) is far below the largest of its level, and no rounding."""
+    small = (largest > 0) & (largest < UNLIKE * _of_level(levels, largest))
+    return (small & (largest >= AT_REST * sizes)).any(axis=0)
+
+
+def _of_level(levels, largest):
+    """The largest of the magnitudes (n_x, ...) of each entry's level."""
+    return np.array([largest[levels == level].max(axis=0) for level in range(levels[-1] + 1)])[levels]
 
 
 def motion_error(model, jets, reference):

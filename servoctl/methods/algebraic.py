@@ -54,18 +54,26 @@ class _Algebraic(Stepping):
     def _outputs(self, t, x):
         return self.f(t, x[: self.model.nq], self.p)
 
+    def _use(self, model):
+        super()._use(model)
+        first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq
+        self.ends = first, first + model.n, first + 2 * model.n
+
+    def _levels(self, y):
+        """γ', γ'' and pivots from the outputs of `Equations.path`."""
+        first, second, end = self.ends
+        return y[first:second], y[second:end], y[end:]
+
     def _split(self, q, y):
         """State (q, γ'), γ'' and pivots from q and the outputs of `Equations.path`."""
-        nq, n = self.model.nq, self.model.n
-        first = nq if self.model.reduction.mechanism.q.plain else 3 * nq
-        end = first + n
-        return np.concatenate([q, y[first:end]]), y[end : end + n], y[end + n :]
+        rates, top, pivots = self._levels(y)
+        return np.concatenate([q, rates]), top, pivots
 
-    def _pivots(self, t, x):
-        return self._split(x[: self.model.nq], self._outputs(t, x))[2]
+    def _pivots_of(self, outputs):
+        return self._levels(outputs)[2]
 
     def _top(self, t, x):
-        return self._split(x[: self.model.nq], self._outputs(t, x))[1]
+        return self._levels(self._outputs(t, x))[1]
 
     def run(self, t0, x0, t1, times, knots):
         """Follow the solution from x0 at t0 to t1 [s], and solve at each of the times (N,) [s]."""
@@ -185,9 +193,8 @@ class _Algebraic(Stepping):
             block = now[first : first + BLOCK]
             q, y, iterations = self.f.newton(block, nodes, self.p)
             self.motion.count(iterations=iterations)
-            state, top, _ = self._split(q, y)
-            solved = q.shape[1]
-            self.motion.add(self.model, block[:solved], state, top)
+            solved, (rates, top, _) = q.shape[1], self._levels(y)
+            self.motion.add(self.model, block[:solved], q, rates, top)
             if solved < len(block):
                 return self._fail(block[solved], x, "Newton's method finds no solution of the program there")
             if solved:

@@ -2,14 +2,15 @@
 
 import ctypes
 import os
-from functools import lru_cache
+import sys
+from functools import lru_cache, reduce
 from threading import Thread
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.function import TAYLOR_COMPILED
+from servoctl.codegen.function import TAYLOR_COMPILED, compiled
 from servoctl.codegen.native import pointer
 from servoctl.methods.algebraic import NODES, STEPS, switched
 from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE
@@ -20,10 +21,12 @@ from servoctl.model.switching import switching
 
 MOST_IN_LANES = 10**6  # of a case
 SHOWN_EVERY = 0.1  # s between two looks at how far the threads are
+IN_CALLER = 1e7  # operations, a few milliseconds, which the calling thread does before it starts others
+OF_A_CASE = ("outcome", "steps", "t", "violation")  # of the results of a case, before its last state
 
 _NUMBERS = ("t0", "t1", "rtol", "longest")
-_COUNTS = ("max_steps", "n_times", "n_cuts", "n_cases", "next", "stop")
-_ARRAYS = ("x0", "p", "atol", "pivots", "times", "cuts", "ends", "samples")
+_COUNTS = ("max_steps", "n_times", "n_cuts", "n_cases", "most", "next", "stop")
+_ARRAYS = ("order", "x0", "p", "atol", "pivots", "times", "cuts", "ends", "samples")
 _KINDS = {ctypes.c_double: _NUMBERS, ctypes.c_int64: _COUNTS, ctypes.c_void_p: _ARRAYS}
 
 
@@ -36,17 +39,26 @@ class _Many(ctypes.Structure):
         super().__init__(**numbers, **{name: pointer(array) for name, array in arrays.items()})
         self.arrays = arrays
 
-    def run(self, library, threads, progress):
-        """Call a C function on threads; whether Ctrl-C ended it."""
-        workers = [Thread(target=library, args=(ctypes.byref(self),)) for _ in range(threads)]
+    def run(self, library, operations, threads, progress):
+        """Call a C function of so many operations a step; whether Ctrl-C ended it.
+
+        It begins in the calling thread: others take longer to start than many problems take.
+        """
+        n, workers = self.n_cases, []
         try:
+            self.most = max(int(IN_CALLER / operations), 1)
+            library(ctypes.byref(self))
+            order = np.flatnonzero(self.arrays["ends"][:, 0] == 0)
+            self.arrays["order"], self.order = order, pointer(order)
+            self.most, self.n_cases, self.next = sys.maxsize, len(order), 0
+            workers += [Thread(target=library, args=(ctypes.byref(self),)) for _ in range(min(threads, len(order)))]
             for worker in workers:
                 worker.start()
             for worker in workers:
                 while worker.is_alive():
                     worker.join(SHOWN_EVERY)
                     if progress:
-                        progress(min(self.next, self.n_cases))
+                        progress(n - self.n_cases + min(self.next, self.n_cases))
         except KeyboardInterrupt:
             self.stop = 1  # which the threads read at each step
             for worker in workers:
@@ -79,16 +91,17 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
 
     Returns
     -------
-    ends : (N, 3 + 2 n_x) array
+    ends : (N, 4 + 2 n_x) array
         Outcome (1: finished, 0: not reached before Ctrl-C, else to be computed by itself), number of steps, last
-        instant, state there, and largest sizes of the state.
+        instant, largest violation of the invariants at start and end, relative to their gradients times the state; the
+        last state, and largest sizes of the state.
     samples : (N, K, n_x) array
         States at the times (K,), in the order of the motion.
     interrupted : bool
     The arrays are None without a compiler.
     """
     f = series_loop(model, last)
-    library = None if f.operations > TAYLOR_COMPILED else _library(f, len(model.state_names))
+    library = None if f.operations > TAYLOR_COMPILED else _library(f, model)
     if library is None:
         return None, None, False
     x0, p, atol = cases
@@ -96,10 +109,10 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
     p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects branches of paths
     arrays = {"x0": x0, "p": p, "atol": atol, "pivots": model.pivot_sizes, "times": times}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
-    arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
+    arrays |= _results(n, len(times), n_x)
     many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times), n_cases=n)
     threads = min(threads or os.cpu_count() or 1, -(-n // compiler.lanes()))
-    interrupted = many.run(library, threads, progress)
+    interrupted = many.run(library, f.operations, threads, progress)
     return arrays["ends"], arrays["samples"], interrupted
 
 
@@ -130,26 +143,33 @@ def plan_many(model, span, cases, times, threads=None, progress=None):
     cuts = breakpoints(span, model.require_smooth((min(span), max(span))))
     arrays = {"x0": x0, "p": p, "pivots": model.pivot_sizes, "times": times, "cuts": cuts}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
-    arrays |= {"ends": np.zeros((n, 3 + 2 * n_x)), "samples": np.full((n, len(times), n_x), np.nan)}
+    arrays |= _results(n, len(times), n_x)
     counts = {"max_steps": NODES, "n_times": len(times), "n_cuts": len(cuts), "n_cases": n}
     many = _Many(arrays, t0=span[0], t1=span[1], longest=abs(span[1] - span[0]) / STEPS, **counts)
-    interrupted = many.run(library, min(threads or os.cpu_count() or 1, n), progress)
+    interrupted = many.run(library, f.operations, min(threads or os.cpu_count() or 1, n), progress)
     ends, samples = arrays["ends"], arrays["samples"]
-    ends[:, 3 : 3 + n_x] = samples[:, -1]
+    ends[:, len(OF_A_CASE) :][:, :n_x] = samples[:, -1]
     return ends, samples, interrupted
 
 
-def _library(f, n_x):
+def _results(n, n_times, n_x):
+    """Arrays for the results of N cases, none of which was computed yet, and the order in which they will be."""
+    order, samples = np.arange(n), np.full((n, n_times, n_x), np.nan)
+    return {"order": order, "ends": np.zeros((n, len(OF_A_CASE) + 2 * n_x)), "samples": samples}
+
+
+def _library(f, model):
     """The C function of a model's series in lanes; None without a compiler."""
     if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
         return None
-    return _loaded(f, n_x, compiler.lanes(), compiler.compiler())
+    off_manifold = model.once("off the manifold", lambda: _off_manifold(model))
+    return _loaded(f, off_manifold, len(model.state_names), compiler.lanes(), compiler.compiler())
 
 
 @lru_cache(32)
-def _loaded(f, n_x, width, _):
+def _loaded(f, off_manifold, n_x, width, _):
     """The same for a number of lanes and a compiler."""
-    library = compiler.library(f"#define W_LANES {width}\n{_source(f, n_x)}", "-O3")
+    library = compiler.library(f"#define W_LANES {width}\n{_source(f, off_manifold, n_x)}", "-O3")
     if library is not None:
         library.servoctl_many.restype = None
     return library and library.servoctl_many
@@ -172,7 +192,18 @@ def _plan_library(f, model):
     return library and library.servoctl_plans
 
 
-def _source(f, n_x):
+def _off_manifold(model):
+    """The largest residual of the invariants, relative to its gradient times the state, as a function of (t, X, p)."""
+    f, m = model.function("invariants").expression, len(model.invariant_names())
+    t, x, p = f.sx_in()
+    y = f(t, x, p)
+    sizes = ca.sqrt(ca.reshape(y[m:], m, -1) ** 2 @ (1 + ca.fabs(x)) ** 2)
+    off = ca.fabs(y[:m]) / ca.if_else(sizes > 0, sizes, 1)
+    largest = ca.densify(reduce(ca.fmax, off.elements(), ca.SX(0)))
+    return compiled(ca.Function("off_manifold", [t, x, p], [largest]), "off_manifold")
+
+
+def _source(f, off_manifold, n_x):
     """The C text for any number of lanes."""
     sizes, chunk = emit.definitions(f.sizes), emit.WIDE if f.operations <= emit.WIDE else emit.CHUNK
     sizes |= {"NAME": "servoctl", "NX": n_x, "NP": f.n_p, "NY": f.n_y}
@@ -181,5 +212,6 @@ def _source(f, n_x):
     sizes |= {} if settled is None else {"SETTLED": ""}
     expansion = emit.function(f.expression, "expansion", emit.LANES, chunk)  # in one piece values stay in registers
     parts = [emit.unit(sizes), emit.include("lanes.h"), expansion]
+    parts += [emit.function(off_manifold.expression, "off_manifold", emit.LANES)]
     parts += [] if settled is None else [emit.function(settled, "servoctl_settled", emit.PORTABLE)]
     return "".join((*parts, emit.include("many.c")))

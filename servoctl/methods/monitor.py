@@ -12,6 +12,7 @@ import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.methods.sizes import motion_sizes
+from servoctl.model.model import STRONG
 from servoctl.model.report import explain
 from servoctl.tolerances import ENTRY
 
@@ -228,6 +229,7 @@ class Monitor:
         self.f, self.invariants = model.function("matrices"), model.function("invariants")
         self.l_names, self.b_names = model.leading_names()
         self.reference, self.lift = None, 1.0
+        self.earlier = () if before is None else (*(m for m in before.earlier if m is not model), before.model)
         self.balances = list(model.balances())
         self.stories = [model.row_stories(), {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
@@ -357,7 +359,7 @@ class Monitor:
         Fine, Repivot or Singular
         """
         n_g, count, m = stretch.pivots.shape
-        if not stretch.pivots.size:
+        if not stretch.pivots.size or self._all_strong(stretch.pivots.reshape(n_g, -1)):
             return Fine(count)
         pole = self._pole(stretch)
         if pole is not None:
@@ -382,6 +384,19 @@ class Monitor:
             self.sunk = None
         self.recent = track[:, -2:]
         return Fine(count)
+
+    def _all_strong(self, pivots):
+        """Whether pivots (n_g, N) keep their signs and their sizes so well that nothing else needs to be inspected."""
+        last, sizes = self.recent[:, -1], np.abs(pivots)
+        before = np.maximum(sizes[:, :-1].max(axis=1, initial=0.0), self.reference)
+        largest = np.maximum(before, sizes[:, -1])
+        weakest = np.minimum((pivots * np.sign(last)[:, None]).min(axis=1), np.abs(last) * largest)
+        usual = np.maximum(self.reference, self.model.pivot_sizes)
+        if not ((weakest > DEGRADED * largest).all() and (NEGLIGIBLE * largest <= usual).all()):
+            return False
+        earlier = pivots[:, -2] / before if pivots.shape[1] > 1 else last
+        self.sunk, self.reference, self.recent = None, largest, np.array([earlier, pivots[:, -1] / largest]).T
+        return True
 
     def _pole(self, stretch):
         """Singular where a pivot grows without bound in one step, as that of a row divided by a speed that vanishes."""
@@ -529,13 +544,12 @@ class Monitor:
     def repivoted(self, t, x, top, same_rows=True):
         """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds.
 
-        With the same rows, which other pivots solve, or derived again.
+        With pivots that the motion had before, with others of the same rows, or derived again.
         """
         jets = np.append(x, np.nan_to_num(top))
-        if same_rows and self.rank_measure(t, x) > LOST:
-            other = self.model.without_choice or self._reordered(t, jets)
-            if other is not None:
-                return other, Monitor(other, t, x, self)
+        other = (self._before(t, jets) or self._of_same_rows(t, x, jets)) if same_rows else None
+        if other is not None:
+            return other, Monitor(other, t, x, self)
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
             model = self.model.near(t, jets, sizes)
@@ -543,12 +557,25 @@ class Monitor:
         except ServoError:
             return None
 
+    def _before(self, t, jets):
+        """The strongest of the earlier variants of this motion; None if all have weak pivots at these jets."""
+        strengths = [(model.strength(t, jets), -i, model) for i, model in enumerate(self.earlier)]
+        strength, _, model = max(strengths, default=(0.0, 0, None))
+        return model if strength > STRONG else None
+
+    def _of_same_rows(self, t, x, jets):
+        """The model with other pivots of the same rows; None if there are none, or the rows have lost their rank."""
+        known = self.model.reduction.cascade is None  # else matrices have no value where pivots of a block vanish
+        if known and self.rank_measure(t, x) <= LOST:
+            return None
+        return self.model.without_choice or self._reordered(t, jets)
+
     def _reordered(self, t, jets):
         """The model with other pivots of the leading matrix, unless the rows divide by a pivot that is weak."""
         count = len(self.model.row_pivots)
         pivots = np.abs(self.model.pivots_at(t, jets)[:count])
         sizes = self.model.pivot_sizes if self.reference is None else self.reference
-        strong = np.all(pivots > HELPS * DEGRADED * sizes[:count])
+        strong = np.all(pivots > STRONG * sizes[:count])
         return self.model.reordered(t, jets) if strong else None
 
     def failed(self, t, x, why, what, do):

@@ -43,6 +43,7 @@ class Motion:
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one
     room: int = 0  # samples of the whole motion
+    largest: float | np.ndarray = 0.0  # magnitudes (n_x,) of X at the ends of steps
     _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _jets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -60,8 +61,8 @@ class Motion:
     def _end(self):
         return self.pieces[-1][-1] if self.pieces else 0
 
-    def add(self, model, t, x, top):
-        """Append samples t (N,), X (n_x, N) and γ^(s̄) (n, N) computed with one variant of the model."""
+    def add(self, model, t, *levels):
+        """Append samples t (N,) and the levels of their jets, (m, N) each, computed with one variant of the model."""
         start, t = self._end, np.asarray(t)
         shared = int(start > 0 and len(t) > 0 and t[0] == self._t[start - 1])
         further = t[1:] != t[:-1]
@@ -71,9 +72,11 @@ class Motion:
         if end == start:
             return
         if end > len(self._t):
-            self._reserve(max(end, 2 * start, min(self.room, MOST_RESERVED)), len(x) + len(top))
-        self._t[start:end] = t[new]
-        self._jets[: len(x), start:end], self._jets[len(x) :, start:end] = x[:, new], top[:, new]
+            self._reserve(max(end, 2 * start, min(self.room, MOST_RESERVED)), sum(map(len, levels)))
+        self._t[start:end], row = t[new], 0
+        for level in levels:
+            self._jets[row : row + len(level), start:end] = level[:, new]
+            row += len(level)
         self.pieces.append((model, start - shared, start, end))
 
     def _reserve(self, room, rows):
@@ -86,6 +89,10 @@ class Motion:
     def by_piece(self):
         """The (model, t, jets) of each piece."""
         return [(model, self._t[a:b], self._jets[:, a:b]) for model, _, a, b in self.pieces]
+
+    def reaches(self, x):
+        """Take in the states (n_x, S) at the ends of steps."""
+        self.largest = np.fmax(self.largest, np.abs(x).max(axis=1))
 
     def end_before(self, t, error):
         """Drop the samples from an instant t [s] on, and stop there for an error."""
@@ -143,9 +150,9 @@ def margin_at(t, span):
 
 def breakpoints(span, knots):
     """The span cut at the knots inside it, in the direction of integration."""
-    t0, t1 = span
+    (t0, t1), knots = span, np.asarray(knots, dtype=float)
     low, high = min(span), max(span)
-    inside = [k for k in knots if low + margin_at(low, span) < k < high - margin_at(high, span)]
+    inside = knots[(knots > low + margin_at(low, span)) & (knots < high - margin_at(high, span))].tolist()
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
 
 
@@ -203,6 +210,7 @@ class Stepping:
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
     knots = frozenset()  # inside the span
+    cuts = np.zeros(0)  # at which steps end: the ends of the span, and these knots
     again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
@@ -239,14 +247,25 @@ class Stepping:
             self.span = t0, t1
             self._watch(t0, x0, t1)
             t, x, cuts = t0, x0, breakpoints(self.span, knots)
-            self.knots = {c for c in cuts if any(abs(c - k) <= margin_at(c, self.span) for k in knots)}
+            at_ends = (c for c in self.span if (np.abs(np.subtract(knots, c)) <= margin_at(c, self.span)).any())
+            self.cuts, self.knots = np.array(cuts), {*cuts[1:-1], *at_ends}
+            ends = self._ends(cuts)
             self._start(t, x, cuts[1])
             self.motion.room = self._samples(cuts, t_eval)
-            for b in cuts[1:]:
+            for b in ends:
                 while t != b and self.motion.stop is None and not self.motion.ended:
-                    due = (t_eval >= min(t, b)) & (t_eval <= max(t, b)) & ((t_eval != t) | (t == t0))
-                    t, x = self._piece(t, x, b, t_eval[due])
+                    t, x = self._piece(t, x, b, self._due(t_eval, t, b))
         return self.motion
+
+    def _ends(self, cuts):
+        """The ends of the pieces that are integrated one after the other."""
+        return cuts[1:]
+
+    def _due(self, t_eval, t, b):
+        """The instants of samples after t, or from the start on, up to b."""
+        forward = np.sign(self.span[1] - self.span[0])
+        before = np.searchsorted(forward * t_eval, forward * t, "left" if t == self.span[0] else "right")
+        return t_eval[before : np.searchsorted(forward * t_eval, forward * b, "right")]
 
     def _samples(self, cuts, t_eval):
         """The number of samples of a whole motion through instants (K,) at which pieces end."""
@@ -275,6 +294,7 @@ class Stepping:
     def _inspected(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
         outcome = self._smooth(stretch)
+        self.motion.reaches(stretch.x[:, : outcome.steps + 1])
         return outcome if self.events is None else self._event(stretch, outcome) or outcome
 
     def _event(self, stretch, outcome):
@@ -362,20 +382,28 @@ class Stepping:
     def _start(self, t, x, b):
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
         self.monitor = Monitor(self.model, t, x)
-        if self.monitor.bad_choice(self._outputs(t, x), self._pivots(t, x)):
+        if self.monitor.bad_choice(*self._with_pivots(t, x)):
             for same_rows in (True, False):  # whose rows may divide by a pivot that is zero there
                 variant = self.monitor.repivoted(t, x, self._top(t, x), same_rows)
                 if variant is not None:
                     self._go_on(variant, t, x)
-                if not self.monitor.without_value(self._outputs(t, x), self._pivots(t, x)):
+                if not self.monitor.without_value(*self._with_pivots(t, x)):
                     break
-            self.motion.stop = self.monitor.refuse_start(t, x, self._outputs(t, x), self._pivots(t, x))
+            self.motion.stop = self.monitor.refuse_start(t, x, *self._with_pivots(t, x))
 
     def _outputs(self, t, x):
         return self.f(t, x, self.p)
 
+    def _with_pivots(self, t, x):
+        """The outputs at a state, and the pivots among them."""
+        outputs = self._outputs(t, x)
+        return outputs, self._pivots_of(outputs)
+
     def _pivots(self, t, x):
-        return self._outputs(t, x)[self.n_x :]
+        return self._pivots_of(self._outputs(t, x))
+
+    def _pivots_of(self, outputs):
+        return outputs[self.n_x :]
 
     def _top(self, t, x):
         """γ^(s̄) at a state."""

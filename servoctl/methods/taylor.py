@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import Compiled, compiled
+from servoctl.codegen.interpreted import weighted
 from servoctl.errors import SingularProgram
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.identity import spread, vanish
@@ -403,8 +404,8 @@ class TaylorSteps(Stepping):
     model : Model
     drift : None or Project
     method : Taylor
-    atol : float
-        Its absolute tolerance.
+    atol : float or (n_x,) array
+        Its absolute tolerance; entries of a level are compared in their own ones.
     progress : callable
     """
 
@@ -424,29 +425,43 @@ class TaylorSteps(Stepping):
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
-        plain = model.reduction.mechanism.q.plain
-        self.n_c = (0 if plain else self.nq * last) + self.n * last
+        self.plain = model.reduction.mechanism.q.plain
+        self.n_c = (0 if self.plain else self.nq * last) + self.n * last
         self.integrated = self._integrated_levels()
 
-    def _start(self, t, x, b):
-        self.p = np.append(self.model.parameters, (t + b) / 2)
-        super()._start(t, x, b)
+    def _ends(self, cuts):
+        """The end alone: the compiled loop ends steps at knots."""
+        self.ordered = self.cuts * np.sign(cuts[-1] - cuts[0])
+        return cuts[-1:]
 
-    def _pivots(self, t, x):
-        return self._outputs(t, x)[self.n_c :]
+    def _outputs(self, t, x):
+        return self.f(t, x, self._on_branch(t))
+
+    def _on_branch(self, t):
+        """The parameters, and an instant of the piece that follows t, which selects the branches of paths."""
+        k = np.clip(self._next(t), 1, len(self.cuts) - 1)
+        return np.append(self.model.parameters, self.cuts[k - 1 : k + 1].mean())
+
+    def _next(self, t):
+        """The place of the first cut after t."""
+        return int(np.searchsorted(self.ordered, t * np.sign(self.cuts[-1] - self.cuts[0]), "right"))
+
+    def _pivots_of(self, outputs):
+        return outputs[self.n_c :]
 
     def _top(self, t, x):
         """Zeros for γ^(s̄): it only starts the search for other pivots, and its value would cost a series."""
         return np.zeros(self.n)
 
     def _piece(self, a, x, b, times):
-        self.p = np.append(self.model.parameters, (a + b) / 2)  # paths take the branches of this piece
         self.monitor.begin(self._pivots(a, x))
         self.watch.begin(a)
         until = b
         while a != b and self.motion.stop is None:
-            rows = self.f.taylor(a, x, until, self.p, *self.tolerances, self.most, self.every)
-            log = _Log(self.f, self.n_x, self.p, rows)
+            p, ends = self._on_branch(a), self.cuts[self._next(a) :]
+            ends = ends if until == b else np.append(ends[(ends < until) == (a < b)], until)
+            rows = self.f.taylor(a, x, ends, p, *self.tolerances, self.most, self.every)
+            log = _Log(self.f, self.n_x, p, rows)
             taken, good = len(rows) - 1, self._believed(log, abs(b - a))
             if good < taken:
                 self._doubt(log.t[good])
@@ -476,7 +491,7 @@ class TaylorSteps(Stepping):
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             row = np.concatenate([[a], x, self._outputs(a, x)])
-            self._sample(_Log(self.f, self.n_x, self.p, np.array([row, row])), times, a)
+            self._sample(_Log(self.f, self.n_x, self._on_branch(a), np.array([row, row])), times, a)
         return a, x
 
     def _leave_if_stiff(self, t, x):
@@ -510,20 +525,28 @@ class TaylorSteps(Stepping):
         k, at = self._instants(log)
         jets = log.jets(k, at, self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
-        rtol, atol = self.tolerances
-        off, h, last, wrong = np.abs(rates - jets[-n:]), np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
-        farthest, longest = off.max(axis=1), h.max()
+        rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
+        off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
+        h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
+        longest = h.max()
         for level, entries in self.integrated.items():
             raised, part = self.top - level, perm(last, level) / perm(last, self.top - 1)
-            state = log.states[: self.nq] if level == 0 else log.states[self.nq + (level - 1) * n :][:n]
-            largest = np.abs(state).max()
-            if longest**raised * part * farthest[entries].max() <= FAR_OFF * (atol + rtol * largest):
+            state, missed, highest = np.abs(log.states[self._level(level)]), off[entries], top[entries]
+            if weights is not None and (level or self.plain):
+                w = weights[self._level(level), None]
+                state, missed, highest = w * state, w[entries] * missed, w[entries] * highest
+            largest = state.max()
+            if longest**raised * part * missed.max() <= FAR_OFF * (atol + rtol * largest):
                 continue
             part = h[k] ** raised * part
-            sizes = np.maximum(largest, np.abs(part * jets[-n:][entries]).max(axis=0))
-            error = (part * off[entries]).max(axis=0)
+            sizes = np.maximum(largest, (part * highest).max(axis=0))
+            error = (part * missed).max(axis=0)
             wrong |= (error > FAR_OFF * (atol + rtol * sizes)) & (h[k] > SMALLEST * span)
         return int(k[wrong].min(initial=len(t) - 1))
+
+    def _level(self, level):
+        """The places in the state of q, or of γ^(level)."""
+        return slice(self.nq + (level - 1) * self.n, self.nq + level * self.n) if level else slice(0, self.nq)
 
     def _integrated_levels(self):
         """Entries of γ by the highest level at which they are integrated, 0 where only q is."""
@@ -549,7 +572,7 @@ class TaylorSteps(Stepping):
             k, at = np.append(k, steps_of(t, more)), np.append(at, more)
         within = at != t[k]
         if self.knots:  # where paths have other branches
-            within &= ~np.isin(at, list(self.knots))
+            within &= ~np.isin(at, [end for end in t.tolist() if end in self.knots])
         return k[within], at[within]
 
     def _stretch(self, log):

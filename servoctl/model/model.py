@@ -10,7 +10,7 @@ import numpy as np
 
 from servoctl.checks import MOST_JETS, as_numbers, finite, named, whole
 from servoctl.codegen.function import compiled
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.errors import ServoError, SingularProgram, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
 from servoctl.markup import Shown
@@ -28,7 +28,7 @@ from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
-from servoctl.model.validity import affirmed
+from servoctl.model.validity import affirmed, points_with
 from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.definite import Definite, definite
@@ -40,9 +40,12 @@ from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
+from servoctl.tolerances import ENTRY
 from servoctl.values import read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
+AS_DERIVED = "as derived"  # a model with the parameters at which its ranks were decided
+STRONG = 0.1  # of its usual size: pivots above this serve for other parameters, or again
 DIAGONAL = "diagonal"  # pivots of definite matrices, beside places of other pivots
 MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the same ones again
 
@@ -204,10 +207,14 @@ class Model(Shown):
         values = r.mechanism.parameters.values({**current, **changes})
         if not affirmed(self, values):
             require_positive(r.mechanism, replace(r.points, values=values))
-            if not (holds(r, values) and self._constant_pivots_hold(values) and self._dropped_hold(values)):
+            if not self._holds(values):
                 self._store.require_unchanged()
                 return _derived(r.mechanism, r.program, r.context.guess, None, values)
         return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
+
+    def _holds(self, values):
+        """Whether every decision of the derivation is the same with other parameters."""
+        return holds(self.reduction, values) and self._constant_pivots_hold(values) and self._dropped_hold(values)
 
     def _constant_pivots_hold(self, values):
         f = self.once("constant pivots", lambda: self.equations.constant_pivots())
@@ -228,21 +235,22 @@ class Model(Shown):
             [s]
         jets : (n_z,) array
         sizes : dict of str to float, optional
-            Sizes relative to which jets are near zero; default: their sizes where ranks were decided, at most 1.
+            Sizes relative to which jets are near zero; default, also in place of rounding: their sizes where ranks were
+            decided, at most 1.
 
         Returns
         -------
         Model
         """
-        guess = dict(zip(self.jet_names, map(float, jets), strict=True))
+        jets = np.asarray(jets, dtype=float) + 0.0  # without the sign of a zero
         default = self.once("jet sizes", lambda: self.equations.jet_sizes)
         self._store.require_unchanged()
-        r, place = self.reduction, (float(t), guess, default | dict(sizes))
+        sizes = {name: size for name, size in dict(sizes).items() if size > ENTRY * default.get(name, 0.0)}
+        place = (float(t), dict(zip(self.jet_names, jets.tolist(), strict=True)), default | sizes)
         key = repr(place)
         if key in self._variants:
             return self._variants[key]
-        guess = None if r.context.scales is None else self._store.specification[2] or {}
-        near = _derived(r.mechanism, r.program, guess, place, self.parameters)
+        near = self._near_before(t, jets, sizes) or self._derived_near(place)
         if near.free != self.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {self.free}.",
@@ -252,8 +260,30 @@ class Model(Shown):
                 free=near.free,
                 expected=self.free,
             )
-        self._keep(key, Model(near.reduction, near._store, self.parameters, self._knots, variants=self._variants))
+        numbers = self.parameters, self._knots, near._functions, self._variants
+        self._keep(key, Model(near.reduction, near._store, *numbers))
         return self._variants[key]
+
+    def _derived_near(self, place):
+        r = self.reduction
+        guess = None if r.context.scales is None else self._store.specification[2] or {}
+        return _derived(r.mechanism, r.program, guess, place, self.parameters)
+
+    def _near_before(self, t, jets, sizes):
+        """The variant near an instant with the parameters of the derivation, if it serves with these; else None."""
+        r = self.reduction
+        same = np.array_equal(self.parameters, r.context.values)
+        own = self if same else Model(r, self._store, functions=self._functions)
+        first = self._functions.setdefault(AS_DERIVED, own)
+        if first is self:
+            return None
+        try:
+            near = first.near(t, jets, sizes)
+        except ServoError:
+            return None
+        here = Model(near.reduction, near._store, self.parameters, self._knots, near._functions)
+        serves = here.strength(t, jets) > STRONG and (same or near._holds(self.parameters))
+        return here if serves else None
 
     @property
     def without_choice(self):
@@ -277,16 +307,19 @@ class Model(Shown):
             None if the pivots stay, or are not those of the leading matrix.
         """
         r = self.reduction
-        if self.diagonal or r.cascade is not None or self.equations.sparse or (self.flat and self.nq != self.n):
+        if self.diagonal or self.equations.sparse or (r.cascade is None and self.flat and self.nq != self.n):
             return None
-        order = r.order_at(float(t), np.asarray(jets, dtype=float), self.parameters)
+        try:
+            order = r.order_at(float(t), np.asarray(jets, dtype=float), self.parameters)
+        except SingularProgram:
+            return None
         return None if order == r.order else self._formed(order)
 
     def _formed(self, form):
         """The model with the same rows, and pivots by their places, or from the diagonal; None without the latter."""
         key, r = repr((*(self._store.specification[3] or ()), form)), self.reduction
         if key not in self._variants:
-            reduction = definite(r) if form == DIAGONAL else replace(r, order=form)
+            reduction = definite(r) if form == DIAGONAL else r.with_order(form)
             store, functions = self._store.part(form), self._functions.setdefault(str(form), {})
             made = reduction and Model(reduction, store, self.parameters, self._knots, functions, self._variants)
             self._keep(key, made)
@@ -569,6 +602,24 @@ class Model(Shown):
         """
         here = self.reduction.points.at(np.array([t]), jets[:, None], self.parameters)
         return here.evaluate([pivot for _, pivot in self.equations.pivots])[0][:, 0].astype(float)
+
+    def strength(self, t, jets):
+        """The smallest pivot at an instant, relative to its size where pivots were chosen; 0 if one has no value.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        jets : (n_z,) array
+        """
+        pivots, sizes = np.abs(self.pivots_at(t, jets)), self.pivot_sizes
+        relative = pivots / np.where(sizes > 0, sizes, 1.0)
+        return float(np.nan_to_num(relative, nan=0.0, posinf=0.0).min(initial=1.0))
+
+    @cached_property
+    def rank_points(self):
+        """States (n_x, points) at which ranks were decided, with the model's own parameters."""
+        return points_with(self)
 
     @cached_property
     def pivot_sizes(self):

@@ -4,12 +4,13 @@ A rolling machine at rest satisfies its constraints with any heading. Where the 
 begins, its start is that limit.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
-from servoctl.errors import InconsistentStart, SingularProgram
+from servoctl.errors import InconsistentStart, ServoError, SingularProgram
 from servoctl.jets.branches import shown
 from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
 from servoctl.progress import stage
@@ -19,6 +20,7 @@ from servoctl.tolerances import RESOLVED
 STANDS = 1e-9  # velocities below this, relative to the coordinates' size, are rest
 MOVES = 1e-5  # velocities above this, likewise, leave six digits of directions that depend on their squares
 LATER = tuple(1e-3 * 2.0**k for k in range(9))  # of the time to the next knot, where the motion may have begun
+FAINT = 1e-6  # of their usual size: divisors above this leave four digits of what depends on their squares
 NEAR_LIMIT = 1e-2  # rad or m: distance of the first value from the limit up to which extrapolation is trusted
 EQUAL = 1e-9  # difference of values at two instants that is rounding, at velocities of MOVES
 
@@ -69,6 +71,8 @@ def started(model, t, held, guess, hold):
     try:
         state = consistent(model, t, held, guess, hold)
         if _determined(model, state):
+            if _faint(model, t, state.values):
+                raise _division(model, t, state.values, {**(guess or {}), **held}, FAINT)
             return state
     except InconsistentStart as error:
         failure = error
@@ -95,38 +99,63 @@ def division_by_zero(model, t, chosen):
     _, equations, _, x = _at_rest(model, t, chosen)
     if not np.abs(equations.scaled(x)).max(initial=0.0) < TOLERANCE:
         return None
-    r, hidden = model.reduction, {f"combination of {row.story}": row for row in model.reduction.hidden}
-    pivots = [(hidden[name], pivot) for name, pivot in r.pivots if name in hidden]
-    expressions, n_x = [pivot for _, pivot in pivots], len(model.state_names)
-    there = r.points.at([t], np.append(x[:n_x], np.zeros(model.n))[:, None], model.parameters)
-    usual, now = (np.abs(points.evaluate(expressions)[0]).max(axis=1, initial=0.0) for points in (r.points, there))
-    row, pivot = next((p for p, a, b in zip(pivots, now, usual, strict=True) if not a > RESOLVED * b), (None, None))
-    if row is None:
+    return _division(model, t, x, chosen, RESOLVED)
+
+
+def _division(model, t, x, chosen, least):
+    """The error of hidden constraints at t [s], X = x whose divisor is at most `least` of its usual size; else None."""
+    divisors, parts = _divisors(model, model, t, x)
+    small = np.flatnonzero(~(parts > least))
+    if not len(small):
         return None
+    (row, pivot), part, r = divisors[small[0]], parts[small[0]], model.reduction
     later = _first_start(model, t, chosen)
+    size = "zero" if part <= RESOLVED else f"{part:.1g} of its usual size"
     raised = [name for name, k in row.uses.items() if k and name in r.original]
     return SingularProgram(
-        f"At t = {t:.7g} s the hidden constraint {row.name!r} ({row.story}) divides by {shown(pivot)}, which is zero "
+        f"At t = {t:.7g} s the hidden constraint {row.name!r} ({row.story}) divides by {shown(pivot)}, which is {size} "
         "where the program holds there.",
-        "A hidden constraint combines derivatives of residuals, and says nothing where its divisor is zero.",
-        nearest="" if later is None else f"t = {later:g} s, where it is not zero.",
-        do=f"Program {', '.join(f'q.dt({name}, 1)' for name in raised)} in place of the residual itself, and start "
-        f"where the residual is zero{'; or start later' if later is not None else ''}.",
+        "A hidden constraint combines derivatives of residuals, and says nothing where its divisor vanishes.",
+        nearest="" if later is None else f"t = {later:g} s, where it is larger.",
+        do=f"Start {'where it is larger' if later is None else 'then or later'}, or program "
+        f"{', '.join(f'q.dt({name}, 1)' for name in raised)} instead and start where the residual is zero.",
         t=float(t),
         rows=[row.name],
         divisor=shown(pivot),
+        size=float(part),
         residuals=raised,
         nearest_time=later,
     )
 
 
+def _divisors(model, variant, t, x):
+    """The (row, divisor) of a variant's hidden constraints; sizes of these at t [s], X = x relative to usual ones."""
+    hidden, usual = {f"combination of {row.story}": row for row in variant.reduction.hidden}, model.reduction.points
+    divisors = [(hidden[name], pivot) for name, pivot in variant.reduction.pivots if name in hidden]
+    if not divisors:
+        return [], np.zeros(0)
+    there = usual.at([t], np.append(x[: len(model.state_names)], np.zeros(model.n))[:, None], model.parameters)
+    sizes = (np.abs(points.evaluate([pivot for _, pivot in divisors])[0]).max(axis=1) for points in (there, usual))
+    with np.errstate(all="ignore"):
+        return divisors, np.divide(*sizes)
+
+
+def _faint(model, t, x):
+    """Whether hidden constraints divide by next to nothing at t [s], X = x, whichever pivots they are combined with."""
+    if (_divisors(model, model, t, x)[1] > FAINT).all():
+        return False
+    with suppress(ServoError):
+        near = model.near(t, np.append(x, np.zeros(model.n)))
+        return not (_divisors(model, near, t, x)[1] > FAINT).all()
+    return True
+
+
 def _first_start(model, t, chosen):
     """A time [s] shortly after t at which the model has a start near the chosen values; None if none."""
     for later in _later(model, t):
-        try:
-            return consistent(model, later, {}, chosen, None) and later
-        except InconsistentStart:
-            continue
+        with suppress(InconsistentStart):
+            if not _faint(model, later, consistent(model, later, {}, chosen, None).values):
+                return later
     return None
 
 

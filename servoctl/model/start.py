@@ -230,16 +230,20 @@ def _solve(model, t, aim, conditions):
     equations, n_x = JetEquations(model, t, conditions), len(model.state_names)
     finite_there = np.all(np.isfinite(equations(aim.reference)[0][: equations.invariants]))
     x, residual = _best(equations, aim) if finite_there else (aim.reference, np.inf)
-    if not residual < TOLERANCE and model.reduction.cascade is not None:
+    blocks = model.reduction.cascade is not None
+    if not residual < TOLERANCE and blocks:
         x, residual = _by_blocks(model, t, equations, aim)
-    for at in (aim.reference, None):
+    choices = [(aim.reference, model.reordered)] * blocks + [(aim.reference, model.near), (None, model.near)]
+    for at, choose in choices:
         if residual < TOLERANCE:
             break
         if at is None and not finite_there:
             x, residual = _best(equations, aim)
         try:  # a pivot of the model may vanish there
-            near = model.near(t, np.append((x if at is None else at)[:n_x], np.zeros(model.n)))
+            near = choose(t, np.append((x if at is None else at)[:n_x], np.zeros(model.n)))
         except ServoError:
+            continue
+        if near is None:
             continue
         other = JetEquations(near, t, conditions)
         y, residual_there = _best(other, aim)

@@ -6,6 +6,7 @@ as strict as that of `reduction.reduce.holds`, which decides in extended precisi
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,7 @@ from servoctl.jets.branches import sizes_of_terms
 from servoctl.reduction.appell import NEGATIVE
 from servoctl.reduction.manifold import ON_MANIFOLD, at_usual_size, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
-from servoctl.reduction.reduce import HELD, strong
+from servoctl.reduction.reduce import HELD, WEAKER, strong
 from servoctl.tolerances import ENTRY, TINY
 
 TOGETHER = 1000  # sets of parameters, which bounds the memory
@@ -103,15 +104,83 @@ def affirmed_each(model, values):
     with np.errstate(all="ignore"):
         at = _points_of(model)
         if len(result) > 1:  # from the manifold of the model's own parameters others are fewer steps away
-            moved, _, jets = _moved(model, at, model.parameters[:, None])
-            at = jets[: len(at)] if len(moved) else at
-        for first in range(0, len(result), TOGETHER):
-            here = first + np.arange(len(result[first : first + TOGETHER]))
-            moved, t, jets = _moved(model, at, values[:, here])
-            here = here[moved]
-            if len(here):
-                result[here] = _valid(model, known, t, jets, values[:, here])
+            at = model.rank_points
+            result = _plainly_valid(model, at, values)
+        for here in _in_parts(np.flatnonzero(~result)):
+            sets, places = np.unique(values[:, here], axis=1, return_inverse=True)
+            moved, t, jets = _moved(model, at, sets)
+            good = np.zeros(sets.shape[1], bool)
+            if len(moved):
+                good[moved] = _valid(model, known, t, jets, sets[:, moved])
+            result[here] = good[places.ravel()]
     return result
+
+
+def _in_parts(cases):
+    """Cases in parts of a size that the memory holds."""
+    return [cases[first : first + TOGETHER] for first in range(0, len(cases), TOGETHER)]
+
+
+def points_with(model):
+    """States (n_x, points) at which ranks were decided, moved to the manifold of the model's own parameters.
+
+    They stay where that is the same, or where not all reach it.
+    """
+    at, changed = _points_of(model), model.parameters != model.reduction.points.values
+    if not changed[_of_invariants(model)].any():
+        return at
+    moved, _, jets = _moved(model, at, model.parameters[:, None])
+    return jets[: len(at)] if len(moved) else at
+
+
+def _of_invariants(model):
+    """Indices of the parameters on which the invariants depend."""
+
+    def places():
+        f = model.function("invariants").expression
+        t, x, p = f.sx_in()
+        return np.flatnonzero(ca.which_depends(f(t, x, p), p, 1, False)).tolist()
+
+    return model.once("parameters of the invariants", places)
+
+
+def _plainly_valid(model, x, values):
+    """Whether a derivation is plainly valid in each case; the points x (n_x, points) satisfy the rows of all cases."""
+    result, t = np.zeros(values.shape[1], bool), model.reduction.points.t.astype(float)
+    varied = np.flatnonzero((values != model.parameters[:, None]).any(axis=1)).tolist()
+    if not set(varied) & set(_of_invariants(model)):
+        criterion = model.once(f"criterion {varied}", lambda: _criterion(model, varied))
+        for here in _in_parts(np.arange(len(result))):
+            count = len(here)
+            p = np.tile(values[:, here], len(t))
+            met = _evaluated(criterion, np.repeat(t, count), np.repeat(x, count, axis=1), p)
+            result[here] = (met > 0).reshape(len(t), count).all(axis=0)
+    return result
+
+
+def _criterion(model, varied):
+    """A function of (t, X, p), positive where all that depends on some parameters is valid, each by bounds of its own.
+
+    It is positive nowhere if slopes of rows depend on them: others then decide.
+    """
+    known, equations = model.once("quantities", lambda: quantities(model.equations)), model.equations
+    t, x, p = (equations.q.t, equations.state, equations.parameters)
+    rates = model.function("ode").expression(t, x, p)[len(model.state_names) - model.n : len(model.state_names)]
+    y = known.function.expression(t, ca.vertcat(x, rates), p)
+    starts = np.cumsum([0, *known.counts.values()]).tolist()
+    groups = {name: range(*ends) for name, *ends in zip(known.counts, starts, starts[1:], strict=False)}
+    depend = ca.which_depends(y, p[varied], 1, True) if varied else [False] * y.numel()
+    value, size = y[: starts[-1]], y[starts[-1] :]
+    some = {name: [i for i in group if depend[i] or depend[starts[-1] + i]] for name, group in groups.items()}
+    met = [ca.SX(not (some["slopes"] or some["jets"] or some["terms"]))]
+    met += [ca.fabs(value[i]) <= HELD * ca.fmax(size[i], TINY) for i in some["conditions"]]
+    met += [ca.fabs(value[i]) <= ENTRY * size[i] for i in some["dropped"]]
+    for i, least in zip(groups["pivots"], (WEAKER * known.pivots).tolist(), strict=True):
+        met += [ca.fabs(value[i]) >= least, ca.fabs(value[i]) > ENTRY * size[i]] if i in some["pivots"] else []
+    if some["mass"]:
+        mass = ca.reshape(value[list(groups["mass"])], model.n, model.n)
+        met += [pivot > 0 for pivot in ca.ldl(ca.sparsify(mass - NEGATIVE * ca.diag(ca.diag(mass))))[0].elements()]
+    return compiled(equations.function("criterion", x, [reduce(ca.logic_and, met)]), "criterion")
 
 
 def _valid(model, known, t, z, values):

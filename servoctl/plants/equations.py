@@ -9,6 +9,7 @@ import numpy as np
 
 from servoctl.codegen.folding import folded
 from servoctl.codegen.function import compiled
+from servoctl.codegen.interpreted import Interpreter
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model.equations import Invariants
@@ -154,7 +155,7 @@ class PlantEquations:
 
     def _clearly_positive(self, cases):
         """Whether the mass matrix of each case (n_p, N) is far from singular at all points."""
-        M = self._masses(cases).full().reshape(self.q.n, -1, self.q.n).swapaxes(0, 1)
+        M = np.moveaxis(self._masses(cases).reshape(self.q.n**2, -1), 0, 1).reshape(-1, self.q.n, self.q.n)
         size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
         sound = np.isfinite(M).all(axis=(1, 2)) & size.all(axis=1)
         least = np.full(len(M), -np.inf)
@@ -164,16 +165,22 @@ class PlantEquations:
 
     @cached_property
     def _masses(self):
-        """A function of the parameters: the mass matrices at all points, side by side."""
+        """A function of the parameters: the mass matrices at all points."""
         return self._at_points(self.mechanism.mass)
 
     def _at_points(self, matrix):
-        """A function of the parameters: the values of a matrix at all points, side by side."""
-        points = self._material[1]
-        symbols, state = ca.vertcat(*self.mechanism.parameters.symbols), ca.vertcat(*self.q, self.velocity)
-        at = np.vstack([points.t, points.jet(0), points.jet(1)]).astype(float)
-        f = ca.Function("at_points", [self.q.t, state, symbols], [ca.densify(matrix)])
-        return ca.Function("at_points", [symbols], [ca.horzcat(*(f(x[0], x[1:], symbols) for x in at.T))])
+        """A function of parameters (n_p, N): the entries of a matrix in each case and at each point, (n, N, points)."""
+        points, symbols = self._material[1], ca.vertcat(*self.mechanism.parameters.symbols)
+        state = ca.vertcat(*self.q, self.velocity)
+        f = Interpreter(self.function("at_points", ca.vertsplit(ca.vec(ca.densify(matrix))), state, symbols))
+        t, x = np.asarray(points.t, dtype=float), np.vstack([points.jet(0), points.jet(1)]).astype(float)
+
+        def values(cases):
+            n, y = cases.shape[1], np.empty((matrix.numel(), len(t) * cases.shape[1]))
+            f.grid(np.repeat(t, n), np.repeat(x, n, axis=1), np.tile(cases, len(t)), y)
+            return y.reshape(-1, len(t), n).swapaxes(1, 2)
+
+        return values
 
     @cached_property
     def orders(self):
@@ -194,8 +201,8 @@ class PlantEquations:
 
     def _alive(self, values):
         """Whether an entry that was left out is not zero at a point with parameters (n_p, N)."""
-        shares = np.split(np.abs(self._dropped_at_points(values).full()), 2)
-        suspects = (shares[0] > SUSPECT * shares[1]).any(axis=0).reshape(values.shape[1], -1).any(axis=1)
+        shares = np.split(np.abs(self._dropped_at_points(values)), 2)
+        suspects = (shares[0] > SUSPECT * shares[1]).any(axis=(0, 2))
         entries, points = self.entries_dropped, self._material[1]
         return any(alive(entries, replace(points, values=case)).any() for case in values.T[suspects])
 
@@ -210,8 +217,7 @@ class PlantEquations:
 
     def _pivot_sizes(self, values):
         """Least sizes of the pivots over all points (pivots, N) with parameters (n_p, N)."""
-        pivots = np.abs(self._pivots(values).full())
-        return pivots.reshape(len(pivots), values.shape[1], -1).min(axis=2, initial=np.inf)
+        return np.abs(self._pivots(values)).min(axis=2, initial=np.inf)
 
     def _points(self, values):
         """Points of the material constraints with other parameters."""
@@ -220,7 +226,7 @@ class PlantEquations:
 
     @cached_property
     def _pivots(self):
-        """A function of the parameters: the pivots of the accelerations at all points, side by side."""
+        """A function of the parameters: the pivots of the accelerations at all points."""
         return self._at_points(ca.vertcat(*self._solved[1]))
 
     @property

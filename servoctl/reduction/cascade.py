@@ -17,7 +17,7 @@ import numpy as np
 
 from servoctl.jets.series import Motion, Series, is_zero, shifted
 from servoctl.jets.tape import REAL, Tape, add, divide, multiply
-from servoctl.reduction.ranks import clean, eliminate, solve_clean
+from servoctl.reduction.ranks import clean, eliminate, pivot_order, solve_clean
 
 PLACING = 100  # Newton steps to the coordinates of a block, each of at most their size
 PLACED = 1e-17  # relative step at which they are solved
@@ -40,12 +40,15 @@ class Block:
         Quasi-velocities of the block.
     coordinates : tuple of int
         Coordinates whose rates follow from these and earlier ones.
+    order : tuple of (int, int)
+        Row and column of each pivot of its leading matrix; empty if they are chosen at points.
     """
 
     rows: tuple
     places: tuple
     columns: tuple
     coordinates: tuple
+    order: tuple = ()
 
     def leading(self, q):
         """∂ψ/∂γ^(order) in the block's own quasi-velocities, square SX."""
@@ -132,6 +135,23 @@ class Cascade:
         """The points that satisfy the rows up to a level, from others near them."""
         z, solved = self.continued(points, level)
         return replace(points, z=z).take(np.flatnonzero(solved))
+
+    def order_at(self, points, given, level):
+        """Pivots ((row, column), ...) of the reduction's rows, block by block, chosen at jets up to the given level."""
+        points, order = replace(points, z=self.continued(points, level, given)[0]), []
+        for block in self.blocks:
+            leading = block.leading(self.q)
+            pivots = pivot_order(leading, clean(*points.matrix(leading)))
+            order += [(block.places[i], block.columns[j]) for i, j in pivots]
+        return tuple(order)
+
+    def with_order(self, order):
+        """The cascade with other pivots, as `order_at` chooses them."""
+        blocks = []
+        for block in self.blocks:
+            pairs = ((block.places.index(i), block.columns.index(j)) for i, j in order if i in block.places)
+            blocks.append(replace(block, order=tuple(pairs)))
+        return replace(self, blocks=tuple(blocks))
 
     def along(self, points, given, level, correct=False, running=None, errors=None):
         """The motion by jets up to a given level, and Newton steps to its coordinates where it is `correct`ed first.
@@ -324,7 +344,7 @@ class Expressions(_Follow):
             right[a] -= self.errors.get(block.places[a], 0.0) / factorial(level)
         right = ca.vertcat(*right.values())
         numbers = clean(*self.points.matrix(block.leading(self.q)))
-        solution, pivots = eliminate(self.matrix, right, numbers)
+        solution, pivots = eliminate(self.matrix, right, numbers, order=block.order)
         if first and level:
             self.pivots += pivots
         return [0.0 if x.is_zero() else x for x in solution.elements()]

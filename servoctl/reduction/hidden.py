@@ -174,6 +174,8 @@ def _divided(q, rows, combination, context):
     """
     b, whole = combination.replaces, combination.whole
     if len(combination.support) == 1:
+        if _independent_in_q(q, [rows[b]], combination.points):  # but no velocity moves it where it holds at all times
+            raise _beyond_velocities(q, [rows[b].name])
         raise vanishing_gradient(q, rows[b], context, *_factor(q, rows, b, context))
     level = whole.order
     beside = np.abs(_slopes_beside(q, rows, combination, context)).max(axis=1, initial=0.0)
@@ -342,8 +344,12 @@ def _independent_in_q(q, rows, points):
 
 def _beyond_velocities(q, names):
     listed, velocities = ", ".join(names), ", ".join(q.velocity_names)
+    if len(names) == 1:
+        given = f"The residual {listed} restricts coordinates, but none of the velocities {velocities} moves it there."
+    else:
+        given = f"The residuals {listed} are independent, but {velocities} move them in dependent directions."
     return SpecificationError(
-        f"The residuals {listed} are independent, but the velocities {velocities} move them in dependent directions.",
+        given,
         "Hidden constraints of quasi-velocities are derived from rates where residuals outnumber the directions in "
         "which the velocities move them.",
         do=f"Program the rates q.dt(residual, 1) of {listed}, and start where the residuals are zero; or write the "

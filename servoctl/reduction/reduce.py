@@ -131,9 +131,15 @@ class Reduction(Packed):
         return eliminate(self.leading, right, clean(*self.points.matrix(self.leading)), order=self.order)
 
     def order_at(self, t, jets, values):
-        """Pivots of L chosen at jets (nz,) of an instant t [s], with these parameters."""
+        """Pivots of L, or of its blocks, chosen at jets (nz,) of an instant t [s], with these parameters."""
         here = self.points.at(np.array([t]), jets[:, None], values)
+        if self.cascade is not None:
+            return self.cascade.order_at(here, self.top - 1 if self.free else 0, self.top)
         return pivot_order(self.leading, clean(*here.matrix(self.leading)))
+
+    def with_order(self, order):
+        """The reduction with other pivots, as `order_at` chooses them."""
+        return replace(self, order=order, cascade=self.cascade and self.cascade.with_order(order))
 
     @cached_property
     def conditions(self):

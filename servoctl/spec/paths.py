@@ -23,6 +23,7 @@ from servoctl.errors import SpecificationError
 from servoctl.jets.lookup import columns_at
 
 TIMED_BY_SYMBOLS = 6  # class of a spline whose times are expressions, beyond which they lose 1e-6 to rounding
+MOST_DENSE = 8  # points of a spline that are expressions, beyond which its coefficients are solved for
 MOST_SUMMED = 200  # times of a spline, beyond which its coefficients are a table: each in sums takes 10 ms to derive
 SMOOTHEST = 100  # class of a path, beyond which the terms of its polynomials leave the range of a double
 MISSED = 1e-9  # largest distance of a spline from its points, relative to the largest point
@@ -254,15 +255,17 @@ def spline(t, times, points, smoothness=2, ends="rest"):
             points=count,
             smoothness=k,
         )
+    if ends == "rest":
+        t = ca.fmin(ca.fmax(t, times[0]), times[-1])
     if isinstance(times, ca.SX):
         pieces, times = _symbolic_pieces(times, points, m, ends), times.elements()
+    elif isinstance(points, ca.SX) and count > MOST_DENSE:
+        return _by_coefficients(t, times, points, 2 * m + 1, vanishing)
     elif isinstance(points, ca.SX):
         each = _spline_pieces(times, np.eye(count), 2 * m + 1, vanishing)  # of a point alone: the spline is linear
         pieces = [ca.DM(power) @ points for power in each]
     else:
         pieces = _spline_pieces(times, points, 2 * m + 1, vanishing)
-    if ends == "rest":
-        t = ca.fmin(ca.fmax(t, times[0]), times[-1])
     return piecewise(t, times, pieces)
 
 
@@ -285,8 +288,7 @@ def piecewise(t, times, coefficients):
     """
     if isinstance(times, np.ndarray) and isinstance(coefficients, np.ndarray) and len(times) > MOST_SUMMED:
         return _looked_up(t, times, coefficients)
-    begun = ca.vertcat(1, *(t >= knot for knot in times[1:-1]), 0)
-    inside = begun[:-1] - begun[1:]
+    inside = _inside(t, times)
     times = times if isinstance(times, np.ndarray) else ca.vertcat(*times)
     middle, half = (times[:-1] + times[1:]) / 2, (times[1:] - times[:-1]) / 2
     tau = (t - ca.dot(inside, middle)) * ca.dot(inside, 1 / half)
@@ -294,6 +296,12 @@ def piecewise(t, times, coefficients):
     for power in coefficients[::-1]:
         value = value * tau + ca.mtimes(power.T if isinstance(power, ca.SX) else ca.DM(power.T), inside)
     return value
+
+
+def _inside(t, times):
+    """Whether t lies in each piece, (n - 1, 1) SX of ones and zeros; the first and the last go on outside."""
+    begun = ca.vertcat(1, *(t >= knot for knot in times[1:-1]), 0)
+    return begun[:-1] - begun[1:]
 
 
 def _looked_up(t, times, coefficients):
@@ -305,6 +313,46 @@ def _looked_up(t, times, coefficients):
     for k in range(len(entries) - dim, -1, -dim):
         value = value * tau + ca.vertcat(*entries[k : k + dim])
     return value
+
+
+def _by_coefficients(t, times, points, degree, vanishing):
+    """The value of a spline through expressions, from the degree + 1 of its coefficients c that count on a piece.
+
+    A c = points, where A has a band: operations are in proportion to the number of points, not to its square.
+    """
+    factors, shapes = _basis(times, degree, vanishing)
+    right = ca.vertcat(points, ca.SX(factors.shape[0] - len(times), points.shape[1]))
+    lower, upper = (ca.SX(ca.DM(part.sorted_indices())) for part in (factors.L, factors.U))
+    c = ca.solve(upper, ca.solve(lower, right[np.argsort(factors.perm_r).tolist(), :]))
+    inside, pieces = _inside(t, times).T, len(times) - 1
+    local = [ca.mtimes(inside, c[r : r + pieces, :]) for r in range(degree + 1)]
+    return ca.mtimes(ca.vertcat(*local).T, _looked_up(t, times, shapes))
+
+
+def _basis(times, degree, vanishing):
+    """The factors of A, and the basis on each piece in a time from -1 to 1 by powers, (degree + 1, n - 1, degree + 1).
+
+    The rows of A give the points, and the derivatives at both ends that vanish.
+    """
+    from scipy.interpolate import BSpline
+    from scipy.sparse import csc_matrix
+    from scipy.sparse.linalg import splu
+
+    x, middle, half = _by_intervals(times)
+    knots = np.concatenate([[x[0]] * degree, x, [x[-1]] * degree])
+    basis = BSpline(knots, np.eye(len(x) + degree - 1), degree)
+    ends = [basis(end, nu=order)[None] for end in (x[0], x[-1]) for order in vanishing]
+    try:
+        factors = splu(csc_matrix(np.concatenate([basis(x), *ends])), permc_spec="NATURAL")
+    except RuntimeError:  # singular for very uneven intervals
+        _require_passing(np.full((degree + 1, len(half), 1), np.nan), x[:, None], half)
+    own = np.arange(len(half))[:, None] + np.arange(degree + 1)
+    taylor = [np.take_along_axis(basis(middle, nu=k), own, axis=1) / math.factorial(k) for k in range(degree + 1)]
+    shapes = np.array([c * half[:, None] ** k for k, c in enumerate(taylor)])
+    for points in ((-1.0) ** np.arange(len(x)), x):
+        c = factors.solve(np.append(points, np.zeros(len(ends))))
+        _require_passing((shapes * c[own]).sum(axis=2, keepdims=True), points[:, None], half)
+    return factors, shapes
 
 
 def _smooth_step(sigma, k):
@@ -326,8 +374,7 @@ def _spline_pieces(times, points, degree, vanishing):
     """
     from scipy.interpolate import make_interp_spline
 
-    x = (times - times[0]) / (times[-1] - times[0]) * (len(times) - 1)
-    middle, half = (x[:-1] + x[1:]) / 2, (x[1:] - x[:-1]) / 2
+    x, middle, half = _by_intervals(times)
     conditions = [(order, np.zeros(points.shape[1])) for order in vanishing]
     try:
         curve = make_interp_spline(x, points, k=degree, bc_type=(conditions, conditions) if conditions else None)
@@ -335,7 +382,19 @@ def _spline_pieces(times, points, degree, vanishing):
     except (ValueError, np.linalg.LinAlgError):  # SciPy's equations are singular for very uneven intervals
         taylor = [np.full((len(half), points.shape[1]), np.nan)] * (degree + 1)
     pieces = np.array([c * half[:, None] ** order for order, c in enumerate(taylor)])
-    starts, stops = pieces[::2].sum(axis=0) - pieces[1::2].sum(axis=0), pieces.sum(axis=0)
+    _require_passing(pieces, points, half)
+    return pieces
+
+
+def _by_intervals(times):
+    """Times (n,) in the unit of the mean interval, from 0 on, the middles of the intervals and half their lengths."""
+    x = (times - times[0]) / (times[-1] - times[0]) * (len(times) - 1)
+    return x, (x[:-1] + x[1:]) / 2, (x[1:] - x[:-1]) / 2
+
+
+def _require_passing(pieces, points, half):
+    """Refuse pieces as of `_spline_pieces` that miss their points (n, dim)."""
+    degree, starts, stops = len(pieces) - 1, pieces[::2].sum(axis=0) - pieces[1::2].sum(axis=0), pieces.sum(axis=0)
     miss = max(np.abs(starts - points[:-1]).max(), np.abs(stops - points[1:]).max())
     if not miss <= MISSED * np.abs(points).max():
         ratio = half.max() / half.min()
@@ -348,7 +407,6 @@ def _spline_pieces(times, points, degree, vanishing):
             miss=miss,
             ratio=ratio,
         )
-    return pieces
 
 
 @functools.cache

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -76,7 +77,7 @@ def close_many(
     every : int
         Traces have every n-th sample.
     threads : int, optional
-        Default: one per core.
+        Default: one per core. There is no executor: disturbances may be functions that no process can be sent.
 
     Returns
     -------
@@ -161,9 +162,15 @@ def _resolved(run, constants, starts):
 
 
 def _unit(run):
-    residuals = None if run.plan is None else Residuals(run.plan.model, run.plant)
-    residuals = residuals if residuals and residuals.names else None
+    residuals = None if run.plan is None else _residuals_of_state(run.plan.model, run.plant)
     return unit(run.plant, run.law, tuple(run.loop.disturbed.tolist()), residuals)
+
+
+@lru_cache(32)
+def _residuals_of_state(model, plant):
+    """The residuals of a program that are functions of the state; None if there are none."""
+    residuals = Residuals(model, plant)
+    return residuals if residuals.names else None
 
 
 def _seeds(sensors, n):
@@ -328,11 +335,12 @@ def _study(columns, seeds, names, gathered, meta, reasons):
         results |= {f"max |{name}|": largest, f"rms {name}": rms, f"final {name}": last}
     results = {name: np.where(ended, np.nan, values) for name, values in results.items()}
     errors = np.where(ended, np.where(of_law, "ServoError", "IntegrationStopped"), "")
-    what = np.where(of_law, "the law's answer", "the state")
-    messages = [f"{w} is not finite at t = {t:.6g} s" if e else "" for w, t, e in zip(what, early, ended, strict=True)]
-    errors = errors.astype(object)
+    errors, messages = errors.astype(object), np.full(len(ended), "", dtype=object)
+    for i in np.flatnonzero(ended):
+        what = "the law's answer" if of_law[i] else "the state"
+        messages[i] = f"{what} is not finite at t = {early[i]:.6g} s"
     for i, error in reasons.items():
         place = int(np.sum(finished[:i]))
         errors[place], messages[place] = type(error).__name__, str(error)
-    errors = errors.astype(str)
-    return Study("batch", numbers | results | {"error": errors, "message": np.array(messages)}, meta), gathered
+    texts = {"error": errors.astype(str), "message": messages.astype(str)}
+    return Study("batch", numbers | results | texts, meta), gathered

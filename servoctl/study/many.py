@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.methods.accuracy import ATOL, LARGE, coarse
+from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
 from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
-from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
-from servoctl.methods.sizes import sizes_of
+from servoctl.methods.lanes import OF_A_CASE, fits, integrate, plan_many, plans_fit
+from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -265,10 +265,8 @@ class _Many:
         ends, samples, self.interrupted = integrate(self.model, last, span, cases, rtol, times, threads, progress)
         if ends is None:
             return
-        x, largest = np.split(ends[:, 3:], 2, axis=1)
-        good = (ends[:, 0] > 0) & self._consistent(span[0], x0, p) & self._consistent(span[1], x, p)
-        if method.atol is None:
-            good &= self._default_fits(span, (x0, p), largest, rtol)
+        good = (ends[:, 0] > 0) & (ends[:, 3] <= OFF)
+        good &= self._tolerances_fit(span, (x0, p), ends[:, -x0.shape[1] :], method)
         self._take(which, ends, samples, good)
 
     def plans(self, span, times, threads, progress):
@@ -282,7 +280,7 @@ class _Many:
         """Take what was computed for some cases, as far as it is good."""
         here, n_x = which[good], self.final.shape[1]
         self.done[here], self.steps[here] = True, ends[good, 1]
-        self.final[here], self.samples[here] = ends[good, 3 : 3 + n_x], samples[good]
+        self.final[here], self.samples[here] = ends[good, len(OF_A_CASE) :][:, :n_x], samples[good]
 
     def _prepared(self, span):
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
@@ -324,28 +322,20 @@ class _Many:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
-        sets, places = np.unique(p, axis=0, return_inverse=True)
-        same_knots = (sets[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
-        return (affirmed_each(self.model, sets.T) & same_knots)[places.ravel()]
+        same_knots = (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
+        return affirmed_each(self.model, p.T.copy()) & same_knots
 
-    def _consistent(self, t, x, p):
-        """Whether states (N, n_x) satisfy the invariants."""
-        f, m = self.model.function("invariants"), len(self.model.invariant_names())
-        y = f.grid(t, x.T, p.T)
-        slopes = y[m:].reshape(x.shape[1], m, -1)
-        with np.errstate(all="ignore"):
-            sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x.T))[:, None] ** 2).sum(axis=0))
-            return ~(np.abs(y[:m]) > OFF * np.where(sizes > 0, sizes, 1.0)).any(axis=0)
-
-    def _default_fits(self, span, cases, largest, rtol):
-        """Whether the default absolute tolerance is a small part of the sizes (N, n_x) of a motion, and no rounding."""
-        small = largest.max(axis=1) <= LARGE
-        some = np.flatnonzero((largest < ATOL / rtol).any(axis=1))
+    def _tolerances_fit(self, span, cases, largest, method):
+        """Whether motions with magnitudes (N, n_x) need no tolerances of their own, as `simulate` decides it."""
+        default, levels = method.atol is None, state_levels(self.model)
+        fit = (largest.max(axis=1) <= LARGE) | (not default)
+        some = np.flatnonzero(((largest < ATOL / method.rtol) & default).any(axis=1) | unlike(levels, largest.T))
         if len(some):
             x0, p = (part[some].T for part in cases)
             inertia = self.model.function("matrices").grid(span[0], x0, p)[-self.model.n :]
-            small[some] &= ~coarse(sizes_of(self.model, inertia, largest[some].T, span[1] - span[0]), rtol).any(axis=0)
-        return small
+            sizes = sizes_of(self.model, inertia, largest[some].T, span[1] - span[0])
+            fit[some] &= ~unlike(levels, largest[some].T, sizes) & ~(coarse(sizes, method.rtol).any(axis=0) & default)
+        return fit
 
     def one_by_one(self, span, method, times, progress):
         """Compute the others as `simulate` does."""
@@ -375,20 +365,22 @@ class _Many:
     def result(self, span, times, level, meta):
         """The table of the finished cases, and their signals."""
         which, names = np.flatnonzero(self.done), self.model.state_names
+        finished = slice(None) if len(which) == self.n else which  # a slice is no copy
         if not len(which):
             raise KeyboardInterrupt
         columns = {"case": which}
-        columns |= {name: np.asarray(column)[which] for name, column in self.columns.items()}
-        columns |= {"steps": self.steps[which]}
-        columns |= {f"{FINAL}{name}": self.final[which, j] for j, name in enumerate(names)}
+        columns |= {name: np.array(column)[finished] for name, column in self.columns.items()}
+        columns |= {"steps": self.steps[finished]}
+        columns |= {f"{FINAL}{name}": values for name, values in zip(names, self.final[finished].T.copy(), strict=True)}
         for name in FAILURE:
-            texts = [self.errors.get(i, {}).get(name, "") for i in which.tolist()] if self.errors else [""] * len(which)
-            columns[name] = np.array(texts, dtype=str)
-        samples, t = self.samples[which], _with_end(times, span)
+            columns[name] = np.full(len(which), "")
+            if self.errors:
+                columns[name] = np.array([self.errors.get(i, {}).get(name, "") for i in which.tolist()])
+        samples, t = self.samples[finished], _with_end(times, span)
         if len(t) > len(times):
-            samples = np.append(samples, self.final[which, None], axis=1)
+            samples = np.append(samples, self.final[finished, None], axis=1)
         runs = {i: self.runs[k] for i, k in enumerate(which.tolist()) if k in self.runs}
-        states, p = samples.transpose(2, 1, 0), self.parameters[which].T
+        states, p = samples.transpose(2, 1, 0), self.parameters[finished].T
         meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
         trace = Signals(self.model, t, len(times), states, p, level, runs)
         return Motions(Study("many", columns, meta), times, trace)

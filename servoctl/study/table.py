@@ -241,6 +241,7 @@ def _version(package):
     return metadata.version(package)
 
 
+@functools.cache
 def _processor():
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:

@@ -11,6 +11,7 @@ from units import in_units, scale
 
 import servoctl as sv
 from servoctl.gallery import gallery, spiral
+from servoctl.methods.accuracy import unlike
 from servoctl.methods.choice import as_method
 
 UNITS = (1e-6, 1e6)  # units per metre: megametres to micrometres
@@ -157,8 +158,6 @@ SCALES = [  # units per metre, per kilogram and per second
 REFUSED = {
     ("spiral", 1e-6, 1.0, 1.0), ("spiral", 1e-6, 1e-3, 1.0), ("spiral", 1.0, 1.0, 1e6), ("vtol", 1e3, 1e-3, 1e3),
 }  # fmt: skip
-# Series keep the tolerance of the largest coordinate: angles in radians and places in micrometres need a finer one.
-OF_PLACES_AND_ANGLES = ("trailers", "bicycle")
 
 
 @pytest.mark.parametrize("name", [*CERTIFIED, "bicycle", "furuta-pendulum", "hopper", "reaction-wheels", "trailers"])
@@ -172,8 +171,7 @@ def test_a_scene_moves_alike_in_any_unit(name):
         guess, span = scaled(scene.guess, length, time), tuple(time * s for s in scene.t_span)
         changed = sv.derive(*in_units(mechanism, program, mechanism.units, length, mass, time), guess=guess)
         start = changed.start(span[0], guess=guess, **scaled(scene.start, length, time))
-        method = sv.Taylor(rtol=1e-15) if name in OF_PLACES_AND_ANGLES and length > 1 else None
-        return sv.simulate(changed, start, span, method, t_eval=np.linspace(*span, 51))
+        return sv.simulate(changed, start, span, t_eval=np.linspace(*span, 51))
 
     def ended(*units):  # some scenes end by design
         try:
@@ -198,6 +196,25 @@ def test_a_scene_moves_alike_in_any_unit(name):
             found = run[key][:count] / scale(key, q, mechanism.units, length, time)
             limit = 1e-6 * max(np.abs(expected).max(), 1e-3)
             assert found == pytest.approx(expected, abs=limit), (key, length, mass, time)
+
+
+@pytest.mark.parametrize("method", [None, sv.Taylor(atol=1e-11)], ids=["default", "atol"])
+@pytest.mark.parametrize("offset", [1e3, 1e6])
+def test_a_vehicle_far_from_the_origin_turns_as_at_it(offset, method, gallery_model):
+    """Trailers along a curvature: the equations do not know where they are."""
+    model, t = gallery_model("trailers"), np.linspace(0.0, 4.0, 21)
+    near, far = ({"X": d, "Y": -d, "theta1": 0.0, "theta2": 0.0} for d in (0.0, offset))
+    runs = [sv.simulate(model, model.start(**start), (0.0, 4.0), method, t_eval=t) for start in (near, far)]
+    for name, moved in {"X": offset, "Y": -offset, "theta0": 0.0, "theta1": 0.0, "theta2": 0.0}.items():
+        assert runs[1][name] - moved == pytest.approx(runs[0][name], abs=1e-6), name
+    many = sv.simulate_many(model, far, None, (0.0, 4.0), t_eval=t)
+    assert many.trace["theta1"][:, 0] == pytest.approx(runs[0]["theta1"], abs=1e-6)
+
+
+def test_the_rounding_of_a_coordinate_at_rest_is_no_small_motion():
+    levels, sizes = np.array([0, 0]), np.ones(2)
+    assert unlike(levels, np.array([1.0, 1e-5]), sizes) and not unlike(levels, np.array([1.0, 1e-11]), sizes)
+    assert unlike(levels, np.array([1.0, 1e-11]), np.array([1.0, 1e-11])) and not unlike(levels, np.array([1.0, 0.0]), sizes)
 
 
 @pytest.mark.parametrize(("length", "time"), [(1e6, 1.0), (1e6, 1e6), (1e-6, 1e-6), (1e-6, 1.0)])

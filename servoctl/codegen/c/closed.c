@@ -46,7 +46,7 @@ int64_t FN(closed)(Step *law, Loop *c)
     for (int64_t k = c->sample; ; k++, c->step = 0) {
         const double t = c->t0 + (double)k * c->period;
         const int64_t row = c->first + k < c->rows ? c->first + k : c->rows - 1;
-        double *y = c->law_x + k * (c->n_y + c->n_z), *out = c->law_y + k * c->n_out, *u = c->input + k * c->n_u;
+        double *y = c->law_x + k * c->stride, *out = c->law_y + k * c->n_out, *u = c->input + k * c->n_u;
         if (c->step == 0) {
             for (int i = 0; i < NX; i++) if (!isfinite(x[i])) { c->status = 1; return k; }
             for (int i = 0; i < NX; i++) c->x[k * NX + i] = x[i];
@@ -57,7 +57,7 @@ int64_t FN(closed)(Step *law, Loop *c)
             const double *before = k ? u - c->n_u : c->initial_input;
             for (int64_t i = 0; i < c->n_u; i++) p[c->at_u + i] = u[i] = limited(c, i, command[i], before[i]);
             if (k == c->samples) { c->status = 0; return k + 1; }
-            for (int64_t i = 0; i < c->n_z; i++) y[c->n_y + c->n_z + c->n_y + i] = out[c->n_u + i];
+            for (int64_t i = 0; i < c->n_z; i++) y[c->stride + c->n_y + i] = out[c->n_u + i];
         }
         for (int64_t i = 0; c->step && i < c->n_u; i++) p[c->at_u + i] = u[i];
         for (int64_t s = c->step; s < c->substeps; s++) {

@@ -72,7 +72,7 @@ __attribute__((cold)) int64_t FN(deviations)(int64_t count, const double *cuts, 
         for (double t = cuts[cut - 1]; t != cuts[cut]; steps++, log += 1 + F * (NX + F)) {
             if (steps == most) return -1;
             NAME(t, x, p, y);
-            const double h = step_length(x, y, log_rtol, least), left = cuts[cut] - t;
+            const double h = step_length(x, y, 0, log_rtol, least), left = cuts[cut] - t;
             if (!(h > 1e-13 * (1 + fabs(t)))) return -1;
             const int ends = h >= fabs(left) * (1 - 1e-12);
             const double signed_h = ends ? left : left > 0 ? h : -h;

@@ -1,5 +1,6 @@
 /* Motions of many cases by the Taylor method: the lanes of W are motions with steps of their own, and a lane whose motion
-   ends takes the next case that no thread has taken. Before it comes `expansion`, the function of taylor.c in lanes, with its sizes. */
+   ends takes the next case that no thread has taken. Before it come `expansion`, the function of taylor.c in lanes, with its
+   sizes, and `off_manifold`, by which part of the state's size it violates the invariants. */
 #include "unit.h"
 #include "lanes.h"
 #include "series.h"
@@ -10,15 +11,18 @@
 typedef struct {
     W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1];
     W pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
+    W violation;    /* the larger one of the start and here */
     W ahead[N + 1]; /* gamma^(s) at the end of the step, by its series */
     I steps;
     int64_t of[W_LANES], sampled[W_LANES];
 } Motions;
 
+/* `rough_log2` of series.h in lanes, as a polynomial of the mantissa, 1 + f. */
 INLINE W w_rough_log2(W a)
 {
-    const W f = w_value((w_bits(a) & 0x000fffffffffffffLL) | 0x3ff0000000000000LL) - 1.0;
-    return __builtin_convertvector((w_bits(a) >> 52) - 1023, W) + f * (1.0 + BEND - BEND * f);
+    const W mantissa = w_value((w_bits(a) & 0x000fffffffffffffLL) | 0x3ff0000000000000LL);
+    const W exponent = __builtin_convertvector(w_bits(a) >> 52, W) - (1024.0 + 2 * BEND);
+    return exponent + mantissa * (1.0 + 3 * BEND - BEND * mantissa);
 }
 
 INLINE W w_rough_exp2(W a)
@@ -32,8 +36,11 @@ INLINE W w_rough_exp2(W a)
 INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     W largest = ALL(0.0);
+    int some = 0;
     for (int64_t i = 0; i < n; i++) {
-        if (!level || IS_FREE((level - 1) * N + i)) largest = w_larger_size(w_fabs(v[i]), largest);
+        if (level && !IS_FREE((level - 1) * N + i)) continue;
+        largest = some ? w_larger_size(w_fabs(v[i]), largest) : w_fabs(v[i]);
+        some = 1;
     }
     return largest;
 }
@@ -47,9 +54,9 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_r
         const int64_t k = term(m);
         if (k <= level || k == 0) continue;
         const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, level));
-        const W growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
-        const W h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
-        shortest = w_lesser(h, shortest);
+        const double part = 1.0 / (double)(k - level);
+        const double all = log_rtol * (1.0 / (double)(LAST - level)) - rough_log2(falling(k, level)) * part;
+        shortest = w_lesser((scale - size) * part + all, shortest);
     }
     return shortest;
 }
@@ -57,8 +64,8 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_r
 /* gamma^(j) or, for j = 0, the change of q, a time h after the expansion. */
 INLINE W w_series(const W *c, int64_t n, int64_t i, int64_t j, W h)
 {
-    W total = ALL(0.0);
-    for (int64_t k = LAST; k >= (j ? j : 1); k--) total = total * h + falling(k, j) * c[(k - 1) * n + i];
+    W total = falling(LAST, j) * c[(LAST - 1) * n + i];
+    for (int64_t k = LAST - 1; k >= (j ? j : 1); k--) total = total * h + falling(k, j) * c[(k - 1) * n + i];
     return j ? total : total * h;
 }
 
@@ -68,7 +75,7 @@ static int load(Many *m, int64_t lane, Motions *s)
     const int64_t next = next_case(m), from = next < 0 ? 0 : next;
     s->of[lane] = next;
     s->t[lane] = m->t0;
-    s->h[lane] = s->steps[lane] = s->sampled[lane] = 0;
+    s->h[lane] = s->violation[lane] = s->steps[lane] = s->sampled[lane] = 0;
     s->atol[lane] = m->atol[from];
     for (int64_t i = 0; i < NX; i++) s->x[i][lane] = m->x0[from * NX + i];
     for (int64_t i = 0; i < NX; i++) s->largest[i][lane] = fabs(m->x0[from * NX + i]);
@@ -80,12 +87,13 @@ static int load(Many *m, int64_t lane, Motions *s)
 
 static void end(const Many *m, int64_t lane, int64_t outcome, const Motions *s)
 {
-    double *row = m->ends + s->of[lane] * (3 + 2 * NX);
+    double *row = m->ends + s->of[lane] * (RESULTS + 2 * NX);
     row[0] = (double)outcome;
     row[1] = (double)s->steps[lane];
     row[2] = s->t[lane];
-    for (int64_t i = 0; i < NX; i++) row[3 + i] = s->x[i][lane];
-    for (int64_t i = 0; i < NX; i++) row[3 + NX + i] = s->largest[i][lane];
+    row[3] = s->violation[lane];
+    for (int64_t i = 0; i < NX; i++) row[RESULTS + i] = s->x[i][lane];
+    for (int64_t i = 0; i < NX; i++) row[RESULTS + NX + i] = s->largest[i][lane];
 }
 
 /* The samples of a lane in its next step. */
@@ -109,6 +117,15 @@ static void sample(const Many *m, int64_t lane, double h, int ends, Motions *s)
         for (int64_t i = 0; i < NP; i++) p[i] = s->p[i][lane];
         settle(m->times[k], row, p);
     }
+}
+
+/* Note by how much lanes violate the invariants. */
+INLINE void judge(Motions *s, I lanes)
+{
+    if (!w_any(lanes)) return;
+    W off;
+    off_manifold(s->t, s->x, s->p, &off);
+    s->violation = w_select(lanes, w_larger_size(s->violation, off), s->violation);
 }
 
 /* Whether a pivot has another sign than at the start, or is far below or above its largest size so far. */
@@ -151,8 +168,9 @@ void FN(many)(Many *m)
     Motions s = {0};
     int64_t open = 0;
     for (int64_t lane = 0; lane < W_LANES; lane++) open += load(m, lane, &s);
-    while (open) {
-        if (stopped(m)) return;
+    for (int64_t steps = 0; open; steps++) {
+        if (stopped(m) || steps == m->most) return;
+        judge(&s, s.h == 0);
         expansion(s.t, s.x, s.p, s.y);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
         W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
@@ -181,6 +199,7 @@ void FN(many)(Many *m)
         for (int64_t i = 0; i < NX; i++) sum += x[i] * 0.0;
         const I stuck = ~(h_long > 1e-13 * (1.0 + w_fabs(s.t))) | (sum != 0) | (s.steps >= m->max_steps);
         const I arrived = s.t == m->t1, over = fallen | wrong | arrived | stuck;
+        judge(&s, over);
         for (int64_t lane = 0; lane < W_LANES && (m->n_times || w_any(over)); lane++) {
             if (s.of[lane] < 0) continue;
             if (!over[lane]) {

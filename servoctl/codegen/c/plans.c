@@ -25,19 +25,19 @@ static int pivots_fall(const Many *m, int64_t n, const double *nodes)
     return 0;
 }
 
-/* A case; the nodes, x and y are memory for its path and samples. */
-static void plan(const Many *m, int64_t at, double *nodes, double *x, double *y)
+/* A case, and its number of nodes; the nodes, x and y are memory for its path and samples. */
+static int64_t plan(const Many *m, int64_t at, double *nodes, double *x, double *y)
 {
     const double *p = m->p + at * NP;
-    double *row = m->ends + at * (3 + 2 * STATE), *samples = m->samples + at * m->n_times * STATE;
+    double *row = m->ends + at * (RESULTS + 2 * STATE), *samples = m->samples + at * m->n_times * STATE;
     int64_t count;
     const int64_t n = FN(continuation)(m->n_cuts, m->cuts, m->x0 + at * STATE, p, m->longest, m->max_steps, nodes, &count);
     row[0] = STUCK;
-    if (!n || nodes[(n - 1) * NODE] != m->t1) return;
+    if (!n || nodes[(n - 1) * NODE] != m->t1) return n;
     row[0] = PIVOT_FALLS;
-    if (pivots_fall(m, n, nodes)) return;
+    if (pivots_fall(m, n, nodes)) return n;
     row[0] = STUCK;
-    if (FN(newton)(m->n_times, m->times, n, nodes, p, x, y, &count) != m->n_times) return;
+    if (FN(newton)(m->n_times, m->times, n, nodes, p, x, y, &count) != m->n_times) return n;
     row[0] = FINISHED;
     row[1] = (double)(n - 1);
     row[2] = m->t1;
@@ -45,6 +45,7 @@ static void plan(const Many *m, int64_t at, double *nodes, double *x, double *y)
         for (int64_t i = 0; i < NX; i++) samples[i] = x[i * m->n_times + k];
         for (int64_t i = 0; i < N; i++) samples[NX + i] = y[(FIRST + i) * m->n_times + k];
     }
+    return n;
 }
 
 /* Called by each thread; without memory the cases are left as they are. */
@@ -52,7 +53,9 @@ void FN(plans)(Many *m)
 {
     double *nodes = malloc(sizeof(double) * (size_t)(m->max_steps * NODE));
     double *x = malloc(sizeof(double) * (size_t)(m->n_times * NX)), *y = malloc(sizeof(double) * (size_t)(m->n_times * NY));
-    for (int64_t at; nodes && x && y && !stopped(m) && (at = next_case(m)) >= 0;) plan(m, at, nodes, x, y);
+    for (int64_t at, steps = 0; nodes && x && y && steps < m->most && !stopped(m) && (at = next_case(m)) >= 0;) {
+        steps += plan(m, at, nodes, x, y) + m->n_times;
+    }
     free(nodes);
     free(x);
     free(y);

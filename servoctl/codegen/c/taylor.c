@@ -6,12 +6,12 @@
 #include "series.h"
 
 /* The bits of non-negative numbers have the order of the numbers, and those of NaN are largest. Of a level of rates only
-   those count that are integrated. */
-static inline double largest_size(const double *v, int64_t n, int64_t level)
+   those count that are integrated. The weights w (n) may be NULL for 1. */
+static inline double largest_size(const double *v, const double *w, int64_t n, int64_t level)
 {
     int64_t largest = 0;
     for (int64_t i = 0; i < n; i++) {
-        const int64_t bits = s_bits(fabs(v[i]));
+        const int64_t bits = s_bits(w ? w[i] * fabs(v[i]) : fabs(v[i]));
         largest = bits > largest && (!level || IS_FREE((level - 1) * N + i)) ? bits : largest;
     }
     return s_value(largest);
@@ -19,14 +19,15 @@ static inline double largest_size(const double *v, int64_t n, int64_t level)
 
 /* log2 of the step at which the last term is 2^log_rtol of a level x of the state, the terms taken to grow as the
    fastest of some do: single coefficients may vanish. */
-static inline double length(const double *x, const double *c, int64_t n, int64_t level, double log_rtol, double least)
+static inline double length(const double *x, const double *c, const double *w, int64_t n, int64_t level, double log_rtol,
+                            double least)
 {
-    const double scale = rough_log2(least + largest_size(x, n, level));
+    const double scale = rough_log2(least + largest_size(x, w, n, level));
     double shortest = INFINITY;
     for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
         if (k <= level || k == 0) continue;
-        const double size = rough_log2(largest_size(c + (k - 1) * n, n, level));
+        const double size = rough_log2(largest_size(c + (k - 1) * n, w, n, level));
         const double growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
         const double h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
         shortest = h < shortest ? h : shortest;
@@ -34,16 +35,24 @@ static inline double length(const double *x, const double *c, int64_t n, int64_t
     return shortest;
 }
 
-/* The step h at which the last terms of all levels meet the tolerance. */
-static inline double step_length(const double *x, const double *y, double log_rtol, double least)
+/* The step h at which the last terms of all levels meet the tolerance, with weights w (NX) of the state or NULL. */
+static inline double step_length(const double *x, const double *y, const double *w, double log_rtol, double least)
 {
     const double *c = y + (PLAIN ? 0 : NQ * LAST);
-    double log_h = length(x, y, NQ, 0, log_rtol, least);
+    double log_h = length(x, y, w, NQ, 0, log_rtol, least);
     for (int64_t j = 1; j < TOP; j++) {
-        const double of_level = length(x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
+        const int64_t at = NQ + (j - 1) * N;
+        const double of_level = length(x + at, c, w ? w + at : w, N, j, log_rtol, least);
         log_h = of_level < log_h ? of_level : log_h;
     }
     return rough_exp2(log_h);
+}
+
+/* The same, out of the way of motions without weights. */
+static __attribute__((noinline)) double weighted_step(const double *x, const double *y, const double *w, double log_rtol,
+                                                      double least)
+{
+    return step_length(x, y, w, log_rtol, least);
 }
 
 /* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients.
@@ -64,31 +73,47 @@ static inline void move(const double *x, const double *y, const double *c, doubl
     for (int64_t i = NQ; i < NX; i++) x_next[i] = IS_FREE(i - NQ) ? jet[i] : x[i];
 }
 
-/* Steps from the start (t, x, p) towards t1: at most max_steps, which may be projected. The log has a row (t, x, y) for
-   each step, and one more for the end. One pointer, since ctypes spends most of a call on converting arguments. */
+/* Steps from the start (t, x, p) towards the last of the ends, in the direction of motion, at each of which a step ends: at
+   most max_steps, which may be projected. The log has a row (t, x, y) for each step, and one more for the end. One pointer,
+   since ctypes spends most of a call on converting arguments. */
 typedef struct {
-    double t1, rtol, atol, project_every, max_steps;
+    double count, rtol, atol, project_every, max_steps;
     const double *start;
     double *log;
+    const double *ends, *weights;
 } Steps;
+
+/* p, whose last number is the instant that selects the branches of paths. */
+static inline void on_branch(const double *p, double t, double *branch)
+{
+    for (int64_t i = 0; i < NP - 1; i++) branch[i] = p[i];
+    branch[NP - 1] = t;
+}
 
 /* Steps of the Taylor method. The function gives the coefficients of q (unless plain), those of gamma, and pivots.
    Returns the number of steps; fewer than max_steps without reaching t1 where a step vanishes or is not finite. */
 int64_t FN(taylor)(const Steps *s)
 {
-    const double *p = s->start + 1 + NX, log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, t1 = s->t1;
+    const double log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, *end = s->ends;
+    const double *last = end + (int64_t)s->count - 1;
     const int64_t max_steps = (int64_t)s->max_steps, project_every = (int64_t)s->project_every;
-    double t = s->start[0], *log = s->log;
+    double t = s->start[0], t1 = *end, *log = s->log, p[NP];
     for (int64_t i = 0; i < NX; i++) log[1 + i] = s->start[1 + i];
+    on_branch(s->start + 1 + NX, (t + t1) / 2, p);
     for (int64_t step = 0; ; step++) {
         double *x = log + 1, *y = x + NX, *row = y + NY, *x_next = row + 1;
         log[0] = t;
-        if (step == max_steps || t == t1) {
+        if (step == max_steps || t == *last) {
             settle(t, x, p);
             return step;
         }
+        if (t == t1) {
+            t1 = *++end;
+            p[NP - 1] = (t + t1) / 2;
+        }
         NAME(t, x, p, y);
-        const double *c = y + (PLAIN ? 0 : NQ * LAST), h = step_length(x, y, log_rtol, least);
+        const double *c = y + (PLAIN ? 0 : NQ * LAST), *w = s->weights;
+        const double h = w ? weighted_step(x, y, w, log_rtol, least) : step_length(x, y, 0, log_rtol, least);
         if (!(h > 1e-13 * (1 + fabs(t)))) {
             settle(t, x, p);
             return step;
@@ -136,9 +161,11 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
     }
 #ifdef SETTLED
     for (int64_t at = 0; at < n && settled; at++) {
-        double x[NX + 1], all[NX + N];
+        const double *row = log + k[at] * (1 + NX + NY);
+        double x[NX + 1], branch[NP], all[NX + N];
         for (int64_t i = 0; i < NX; i++) x[i] = jets[i * n + at];
-        FN(settled)(t[at], x, p, all);
+        on_branch(p, (row[0] + row[1 + NX + NY]) / 2, branch);
+        FN(settled)(t[at], x, branch, all);
         for (int64_t i = NQ; i < settled; i++) jets[i * n + at] = all[i];
     }
 #else
