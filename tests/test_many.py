@@ -379,6 +379,26 @@ def test_derivations_are_affirmed_for_each_set_of_parameters_by_itself(gallery_m
         assert holds(model.reduction, column)
 
 
+@pytest.mark.parametrize(
+    "name", ["appell-hamel", "overhead-crane", "winch-crane", "mass-on-car", "two-link-arm", "wheeled-robot", "four-bar"]
+)
+def test_derivations_are_affirmed_at_once_where_they_hold(name, gallery_model):
+    """Parameters of the balances, of the constraints, and of both; what is plainly valid holds in extended precision."""
+    model, rng = gallery_model(name), np.random.default_rng(SEED)
+    columns = np.tile(model.parameters[:, None], 12 * len(model.numbers))
+    factors = np.append(rng.uniform(0.5, 2.0, 7), [0.0, 1e-9, 1e3, -1.0, np.nan])
+    for k in range(len(model.numbers)):
+        columns[k, 12 * k : 12 * k + 12] *= factors
+    both = model.parameters[:, None] * rng.uniform(0.9, 1.1, (len(model.numbers), 20))
+    for values in (*np.split(columns, len(model.numbers), axis=1), both):
+        found = affirmed_each(model, values)
+        alone = np.array([affirmed(model, column) for column in values.T])
+        assert not (alone & ~found).any()
+        assert all(holds(model.reduction, column) for column in values[:, found & ~alone].T)
+        assert all(holds(model.reduction, column) for column in values[:, found][:, -2:].T)
+    assert found.sum() > 10
+
+
 def signals_equal_runs(model, many, start, span, method=None, names=None):
     """Every signal of a run, along the traces and at the end, is that of `simulate` for the case."""
     columns = [name for name in model.numbers if name in many.study.columns]

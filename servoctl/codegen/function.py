@@ -428,7 +428,7 @@ class Compiled:
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        ends, (atol, weights) = np.atleast_1d(np.asarray(ends, dtype=float)), weighted(atol)
+        atol, weights = weighted(atol)
         return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
 
     def jets(self, log, k, t, p, levels, by_rows=False):

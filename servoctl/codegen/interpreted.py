@@ -41,23 +41,30 @@ class Workspace(threading.local):
         self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
         self.start, self._log = row[: 1 + n_x + n_p], np.empty((0, 0))
         self._task = np.zeros(9)  # the Steps of taylor.c: five numbers; addresses of start, log, ends, weights
-        self._task.view(np.int64)[5] = row.ctypes.data
+        self._end = np.zeros(1)
+        self.end, self._addresses = memoryview(self._end), memoryview(self._task.view(np.int64))
+        self._addresses[5], self._own = row.ctypes.data, self._end.ctypes.data
         self.task, self.pointer = memoryview(self._task), ctypes.c_void_p(self._task.ctypes.data)
 
     def log(self, rows, columns):
         """Memory for a log; the next log overwrites it."""
         if len(self._log) < rows:
             self._log = np.empty((rows, columns))
-            self._task.view(np.int64)[6] = self._log.ctypes.data
+            self._addresses[6] = self._log.ctypes.data
         return self._log
 
     def until(self, ends):
-        """Set the ends (N,) of the steps; their array must live as long as the call."""
-        self._task[0], self._task.view(np.int64)[7] = len(ends), ends.ctypes.data
+        """Set the end of the steps, or their ends (N,)."""
+        if isinstance(ends, float):  # an array's address takes as long as a step
+            self.end[0], self.task[0], self._addresses[7] = ends, 1.0, self._own
+        else:
+            self._ends = np.atleast_1d(np.ascontiguousarray(ends, dtype=float))
+            self.task[0], self._addresses[7] = self._ends.size, self._ends.ctypes.data
 
     def weigh(self, weights):
-        """Set the weights of the Taylor method, None for 1; they must live as long as the call."""
-        self._task.view(np.int64)[8] = 0 if weights is None else weights.ctypes.data
+        """Set the weights of the Taylor method, None for 1."""
+        self._weights = weights  # which must live as long as the call
+        self._addresses[8] = 0 if weights is None else weights.ctypes.data
 
 
 class Blocks(threading.local):
@@ -190,12 +197,12 @@ class Interpreter:
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
         start, n_x = self.workspace.start.copy(), self._n_x
-        t, x, p, rows, (t1, *later) = start[0], start[1 : 1 + n_x], start[1 + n_x :], [], ends
+        t, x, p, rows, (t1, *later) = start[0], start[1 : 1 + n_x], start[1 + n_x :], [], np.atleast_1d(ends)
         p[-1] = (t + t1) / 2
         free = np.array(self._sizes.get("free", [1] * (n_x - nq)), dtype=bool).reshape(top - 1, n)
         w = np.ones(n_x) if weights is None else weights
         while True:
-            if len(rows) == max_steps or t == ends[-1]:
+            if len(rows) == max_steps or t == (later or [t1])[-1]:
                 x = self._settle(t, x, p)
                 break
             if t == t1:

@@ -21,7 +21,7 @@ from servoctl.methods.taylor import order_for
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
 MARGIN, FINER = 0.1, 1e-2  # first tolerance relative to the accuracy, and each next one relative to the last
 ATOL = 1e-11  # default absolute tolerance, for motions whose sizes are neither far below nor far above 1
-AT_REST = 1e-10  # of the size that the inertia gives an entry: less is rounding
+NO_MOTION = 1e-10  # of the size that the inertia gives an entry: less is rounding
 UNLIKE = 3e-3  # of the largest of its level: a smaller entry has a tolerance of its own
 COARSE = 10.0  # times rtol: an absolute tolerance above this part of a size decides about its error
 LARGE = 1e3  # size above which the default absolute tolerance comes near rounding and grows with the size
@@ -109,7 +109,7 @@ def unlike_tolerances(levels, largest, sizes, atol=None):
     """
     if not unlike(levels, largest, sizes):
         return None
-    own = np.where(largest >= AT_REST * sizes, largest, sizes)
+    own = np.where(largest >= NO_MOTION * sizes, largest, sizes)
     own[own == 0.0] = 1.0
     return ATOL * own if atol is None else atol * np.minimum(own / np.fmax(_of_level(levels, largest), own), 1.0)
 
@@ -117,7 +117,7 @@ def unlike_tolerances(levels, largest, sizes, atol=None):
 def unlike(levels, largest, sizes=0.0):
     """Whether an entry of (n_x, ...) is far below the largest of its level, and no rounding."""
     small = (largest > 0) & (largest < UNLIKE * _of_level(levels, largest))
-    return (small & (largest >= AT_REST * sizes)).any(axis=0)
+    return (small & (largest >= NO_MOTION * sizes)).any(axis=0)
 
 
 def _of_level(levels, largest):

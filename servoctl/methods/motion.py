@@ -150,7 +150,10 @@ def margin_at(t, span):
 
 def breakpoints(span, knots):
     """The span cut at the knots inside it, in the direction of integration."""
-    (t0, t1), knots = span, np.asarray(knots, dtype=float)
+    t0, t1 = span
+    if not len(knots):
+        return [t0, t1]
+    knots = np.asarray(knots, dtype=float)
     low, high = min(span), max(span)
     inside = knots[(knots > low + margin_at(low, span)) & (knots < high - margin_at(high, span))].tolist()
     return [t0, *(inside if t1 >= t0 else reversed(inside)), t1]
@@ -210,7 +213,7 @@ class Stepping:
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
     projects = False  # whether ends of steps are projected before they are inspected
     knots = frozenset()  # inside the span
-    cuts = np.zeros(0)  # at which steps end: the ends of the span, and these knots
+    cuts = ()  # at which steps end: the ends of the span, and these knots
     again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
@@ -248,7 +251,7 @@ class Stepping:
             self._watch(t0, x0, t1)
             t, x, cuts = t0, x0, breakpoints(self.span, knots)
             at_ends = (c for c in self.span if (np.abs(np.subtract(knots, c)) <= margin_at(c, self.span)).any())
-            self.cuts, self.knots = np.array(cuts), {*cuts[1:-1], *at_ends}
+            self.cuts, self.knots = cuts, {*cuts[1:-1], *at_ends} if len(knots) else frozenset()
             ends = self._ends(cuts)
             self._start(t, x, cuts[1])
             self.motion.room = self._samples(cuts, t_eval)

@@ -2,7 +2,7 @@
 
 The stages of a step see nothing of a bump or a blend between them, and no test of its error does. The arguments of the
 functions in the equations show where these can be: along the dense output of a step they are located, and there the
-equations are evaluated.
+equations are evaluated, and beside: the force of a barrier is zero on its top.
 """
 
 import casadi as ca
@@ -11,7 +11,10 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.jets.branches import steep_arguments
 
-SECANTS = 4  # of a zero between two instants, by the secant; to 1e-8 of their distance where arguments are smooth
+ASIDE = 0.7  # change of an argument from its zero, at which odd functions of it are large, such as s exp(-s²)
+SECANTS, MOST_SECANTS = 4, 60  # of a zero between two instants, least and most
+LOCATED = 1e-2  # argument at which a zero is located well enough
+CLOSE = 1e-8  # of an interval, over which an argument is a straight line
 
 
 def arguments(model):
@@ -49,7 +52,7 @@ def _moves(argument, known, q):
 
 
 def centres(f, p, t, x, dense):
-    """Instants at which an argument is zero, or its magnitude least.
+    """Instants at which an argument is zero, or its magnitude least, and those beside at which it differs by 0.7.
 
     Parameters
     ----------
@@ -70,8 +73,11 @@ def centres(f, p, t, x, dense):
     """
     with np.errstate(all="ignore"):
         g = f.grid(t, x, p)
-        i, j = np.nonzero(g[:, :-1] * g[:, 1:] < 0)
-        zeros = _zeros(lambda s: f.grid(s, dense(s), p)[i, np.arange(len(s))], t[j], t[j + 1], g[i, j], g[i, j + 1])
+        below, known = g < 0, ~np.isnan(g)
+        i, j = np.nonzero((below[:, :-1] != below[:, 1:]) & known[:, :-1] & known[:, 1:])
+        zeros = t[j]
+        if len(zeros):
+            zeros = _zeros(lambda s: f.grid(s, dense(s), p)[i, np.arange(len(s))], t[j], t[j + 1], g[i, j], g[i, j + 1])
         size = np.abs(g)
         before, here, after = size[:, :-2], size[:, 1:-1], size[:, 2:]
         least = (here < before) & (here <= after) & (g[:, :-2] * g[:, 2:] > 0)
@@ -80,23 +86,33 @@ def centres(f, p, t, x, dense):
 
 
 def _zeros(function, a, b, left, right):
-    """Zeros of functions between a and b (M,), where they have values of opposite signs, by the Illinois method."""
-    s = a
-    for _ in range(SECANTS if len(a) else 0):
+    """Zeros of functions between a and b (M,) by the Illinois method, and beside; values there have opposite signs.
+
+    Many steps are needed where arguments of exponentials are kept from overflow, and are constant far from their zeros.
+    """
+    s, start, end = a, a, b
+    for step in range(MOST_SECANTS):
         s = b - right * (b - a) / (right - left)
         s = np.where(np.isfinite(s), s, (a + b) / 2)
         value = function(s)
         beyond = value * right < 0
         a, left = np.where(beyond, b, a), np.where(beyond, right, left / 2)
         b, right = s, value
-        if not np.any(value):
+        if not np.any(value) or (step >= SECANTS - 1 and not np.any(np.abs(value) > LOCATED)):
             break
-    return s
+    h = CLOSE * (end - start)
+    return _aside(s, ASIDE * 2 * np.abs(h) / np.abs(function(s + h) - function(s - h)), start, end)
 
 
 def _vertices(t, size, i, j):
-    """Where the parabola through three instants about j (M,) is least."""
+    """Where the parabola through three instants about j (M,) is least, and beside."""
     h0, h1 = t[j] - t[j - 1], t[j + 1] - t[j]
     d0, d1 = (size[i, j] - size[i, j - 1]) / h0, (size[i, j + 1] - size[i, j]) / h1
     s = t[j] - (d0 * h1 + d1 * h0) / (2 * (d1 - d0))
-    return np.where(np.isfinite(s), s, t[j])
+    s = np.where(np.isfinite(s), s, t[j])
+    return _aside(s, np.sqrt(ASIDE * np.abs((h0 + h1) / (d1 - d0))), t[j - 1], t[j + 1])
+
+
+def _aside(s, distance, a, b):
+    """Instants s (M,), and those at a distance (M,) before and after them between a and b (M,)."""
+    return np.concatenate([s, *(np.clip(s + d, np.minimum(a, b), np.maximum(a, b)) for d in (-distance, distance))])

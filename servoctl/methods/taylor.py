@@ -5,6 +5,7 @@ coefficient κ - o_a, computed with γ_[κ] = 0, and L γ_[κ] = -((κ - o_a)!/�
 motion by one solve with the same L.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 from math import factorial, perm
 
@@ -421,7 +422,7 @@ class TaylorSteps(Stepping):
         super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
-        self.model, self.n_x = model, len(model.state_names)
+        self.model, self.n_x, self.p = model, len(model.state_names), np.append(model.parameters, np.nan)
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
@@ -431,7 +432,7 @@ class TaylorSteps(Stepping):
 
     def _ends(self, cuts):
         """The end alone: the compiled loop ends steps at knots."""
-        self.ordered = self.cuts * np.sign(cuts[-1] - cuts[0])
+        self.ends, self.forward = np.array(cuts), 1.0 if cuts[-1] >= cuts[0] else -1.0
         return cuts[-1:]
 
     def _outputs(self, t, x):
@@ -439,12 +440,18 @@ class TaylorSteps(Stepping):
 
     def _on_branch(self, t):
         """The parameters, and an instant of the piece that follows t, which selects the branches of paths."""
-        k = np.clip(self._next(t), 1, len(self.cuts) - 1)
-        return np.append(self.model.parameters, self.cuts[k - 1 : k + 1].mean())
+        k = min(max(self._next(t), 1), len(self.cuts) - 1)
+        self.p[-1] = (self.cuts[k - 1] + self.cuts[k]) / 2
+        return self.p
+
+    def _until(self, a, b):
+        """The cuts after a, and b, at which steps end."""
+        ends = self.ends[self._next(a) : self._next(b)]
+        return ends if len(ends) and ends[-1] == b else np.append(ends, b) if len(ends) else float(b)
 
     def _next(self, t):
         """The place of the first cut after t."""
-        return int(np.searchsorted(self.ordered, t * np.sign(self.cuts[-1] - self.cuts[0]), "right"))
+        return bisect_right(self.cuts, self.forward * t, key=lambda cut: self.forward * cut)
 
     def _pivots_of(self, outputs):
         return outputs[self.n_c :]
@@ -458,8 +465,7 @@ class TaylorSteps(Stepping):
         self.watch.begin(a)
         until = b
         while a != b and self.motion.stop is None:
-            p, ends = self._on_branch(a), self.cuts[self._next(a) :]
-            ends = ends if until == b else np.append(ends[(ends < until) == (a < b)], until)
+            p, ends = self._on_branch(a), self._until(a, until)
             rows = self.f.taylor(a, x, ends, p, *self.tolerances, self.most, self.every)
             log = _Log(self.f, self.n_x, p, rows)
             taken, good = len(rows) - 1, self._believed(log, abs(b - a))

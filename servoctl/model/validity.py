@@ -145,42 +145,85 @@ def _of_invariants(model):
 
 
 def _plainly_valid(model, x, values):
-    """Whether a derivation is plainly valid in each case; the points x (n_x, points) satisfy the rows of all cases."""
+    """Whether a derivation is plainly valid in each case, by points x (n_x, points) of the model's own manifold."""
     result, t = np.zeros(values.shape[1], bool), model.reduction.points.t.astype(float)
     varied = np.flatnonzero((values != model.parameters[:, None]).any(axis=1)).tolist()
-    if not set(varied) & set(_of_invariants(model)):
-        criterion = model.once(f"criterion {varied}", lambda: _criterion(model, varied))
-        for here in _in_parts(np.arange(len(result))):
-            count = len(here)
-            p = np.tile(values[:, here], len(t))
-            met = _evaluated(criterion, np.repeat(t, count), np.repeat(x, count, axis=1), p)
-            result[here] = (met > 0).reshape(len(t), count).all(axis=0)
+    moving = bool(set(varied) & set(_of_invariants(model)))
+    varied = None if moving else varied
+    criterion = model.once(f"criterion {varied}", lambda: _criterion(model, varied))
+    if criterion is None:
+        return result
+    for here in _in_parts(np.arange(len(result))):
+        count = len(here)
+        at = np.repeat(t, count), np.repeat(x, count, axis=1), np.tile(values[:, here], len(t))
+        met = _evaluated(criterion, *(_on_manifold(model, *at) if moving else at))
+        result[here] = (met > 0).reshape(len(t), count).all(axis=0)
     return result
 
 
 def _criterion(model, varied):
-    """A function of (t, X, p), positive where all that depends on some parameters is valid, each by bounds of its own.
+    """A function of (t, X, p), positive where a derivation is valid, each bound being met at each point by itself.
 
-    It is positive nowhere if slopes of rows depend on them: others then decide.
+    It has only what depends on the varied parameters, or all where points move with them (None). There is no function
+    if slopes of rows depend on them: these are judged at all points together.
     """
     known, equations = model.once("quantities", lambda: quantities(model.equations)), model.equations
-    t, x, p = (equations.q.t, equations.state, equations.parameters)
-    rates = model.function("ode").expression(t, x, p)[len(model.state_names) - model.n : len(model.state_names)]
-    y = known.function.expression(t, ca.vertcat(x, rates), p)
+    t, x, p, n, n_x = equations.q.t, equations.state, equations.parameters, model.n, len(model.state_names)
+    y = known.function.expression(t, ca.vertcat(x, model.function("ode").expression(t, x, p)[n_x - n : n_x]), p)
+    value, size = ca.vertsplit(y, y.numel() // 2)
+    depend = [True] * y.numel() if varied is None else ca.which_depends(y, p[varied], 1, True) if varied else []
+    some = {i % value.numel() for i, depends in enumerate(depend) if depends}
     starts = np.cumsum([0, *known.counts.values()]).tolist()
-    groups = {name: range(*ends) for name, *ends in zip(known.counts, starts, starts[1:], strict=False)}
-    depend = ca.which_depends(y, p[varied], 1, True) if varied else [False] * y.numel()
-    value, size = y[: starts[-1]], y[starts[-1] :]
-    some = {name: [i for i in group if depend[i] or depend[starts[-1] + i]] for name, group in groups.items()}
-    met = [ca.SX(not (some["slopes"] or some["jets"] or some["terms"]))]
-    met += [ca.fabs(value[i]) <= HELD * ca.fmax(size[i], TINY) for i in some["conditions"]]
-    met += [ca.fabs(value[i]) <= ENTRY * size[i] for i in some["dropped"]]
+    groups = {name: range(*ends) for name, *ends in zip(known.counts, starts[:-1], starts[1:], strict=True)}
+    if some & {*groups["slopes"], *groups["jets"], *groups["terms"]}:
+        return None
+    met = [ca.SX(1)]
+    met += [ca.fabs(value[i]) <= HELD * ca.fmax(size[i], TINY) for i in some & {*groups["conditions"]}]
+    met += [ca.fabs(value[i]) <= ENTRY * size[i] for i in some & {*groups["dropped"]}]
     for i, least in zip(groups["pivots"], (WEAKER * known.pivots).tolist(), strict=True):
-        met += [ca.fabs(value[i]) >= least, ca.fabs(value[i]) > ENTRY * size[i]] if i in some["pivots"] else []
-    if some["mass"]:
-        mass = ca.reshape(value[list(groups["mass"])], model.n, model.n)
+        met += [ca.fabs(value[i]) >= least, ca.fabs(value[i]) > ENTRY * size[i]] if i in some else []
+    if some & {*groups["mass"]}:
+        mass = ca.reshape(value[list(groups["mass"])], n, n)
         met += [pivot > 0 for pivot in ca.ldl(ca.sparsify(mass - NEGATIVE * ca.diag(ca.diag(mass))))[0].elements()]
+    if varied is None:
+        met += [_manifold(model, t, x, p)[1]]
     return compiled(equations.function("criterion", x, [reduce(ca.logic_and, met)]), "criterion")
+
+
+def _on_manifold(model, t, x, p):
+    """Points (t, x, p) moved to the manifolds of the parameters, as far as Newton's method of full ranks does so."""
+
+    def step():
+        at = model.equations.q.t, model.equations.state, model.equations.parameters
+        return compiled(model.equations.function("to_manifold", at[1], _manifold(model, *at)), "to_manifold")
+
+    f = model.once("to the manifold", step)
+    for _ in range(MOVES):
+        *moved, near = _evaluated(f, t, x, p)
+        if (near > 0).all():
+            break
+        x = np.array(moved)
+    return t, x, p
+
+
+def _manifold(model, t, x, p):
+    """Expressions of the state after a step of `least_steps` to the manifold, and whether it is there before."""
+    m, sizes = len(model.invariant_names()), _sizes_of(model)
+    y = model.function("invariants").expression(t, x, p)
+    residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, -1))
+    scales = ca.sqrt(jacobian**2 @ (sizes + ca.fabs(x)) ** 2)
+    off = [ca.fabs(residual[i]) <= ON_MANIFOLD * ca.if_else(scales[i] > 0, scales[i], 1) for i in range(m)]
+    rows = jacobian @ ca.diag(sizes)
+    lengths = ca.sqrt(ca.sum2(rows**2))
+    rows = ca.diag(1 / lengths) @ rows
+    step = sizes * (rows.T @ ca.ldl_solve(residual / lengths, *ca.ldl(rows @ rows.T))) if m else 0 * x
+    return [x - step, reduce(ca.logic_and, off, ca.SX(1))]
+
+
+def _sizes_of(model):
+    """Sizes (n_x,) of the states at the points where ranks were decided."""
+    points, top = model.reduction.points, model.reduction.top
+    return (points.sizes(top - 1) * points.factorials(top - 1)).astype(float)
 
 
 def _valid(model, known, t, z, values):
@@ -238,9 +281,9 @@ def _moved(model, at, values):
     jets : (n_z, K points) array
         Case by case.
     """
-    points, top, n_x = model.reduction.points, model.reduction.top, len(model.state_names)
+    points, n_x = model.reduction.points, len(model.state_names)
     n_points, cases = len(points.t), values.shape[1]
-    sizes = (points.sizes(top - 1) * points.factorials(top - 1))[:, None]
+    sizes = _sizes_of(model)[:, None]
     invariants, rates = model.function("invariants"), model.function("ode")
     t = np.tile(points.t.astype(float), cases)
     x = np.tile(at, cases)

@@ -41,7 +41,7 @@ def sweep(
 
     On processors of one kind the table is the same, bit for bit, for any number of workers and any order. A case that
     raises becomes a row with the error instead of numbers. Where cases are motions of one model, or loops of one plant,
-    that differ in numbers alone, `simulate_many` and `close_many` compute them in vector lanes, a thousand times as fast.
+    that differ in numbers alone, `simulate_many` and `close_many` compute them in vector lanes, 1,000 times as fast.
 
     Main arguments
 

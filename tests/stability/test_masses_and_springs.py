@@ -1,5 +1,6 @@
 """Masses, springs and guides of extreme numbers: an accurate answer, or a clear refusal."""
 
+import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
@@ -147,3 +148,26 @@ def test_a_guide_of_any_inclination(alpha, slider):
     reference = cf.mass_on_car(run.t, alpha, 1.0)
     assert np.abs(run["s"] - reference["s"]).max() < 1e-9
     assert relative(run["force"], reference["force"]) < 1e-7
+
+
+BARRIERS = {  # of height 1 and width 1 about 0
+    "Gauss": lambda s: ca.exp(-(s**2)),
+    "soliton": lambda s: 1 / ca.cosh(s) ** 2,
+    "plateau": lambda s: ca.exp(-(s**4)),
+}
+
+
+@pytest.mark.parametrize("method", [None, "DOP853", "RadauIIA"])
+@pytest.mark.parametrize("width", [1e-4, 1e-6])
+@pytest.mark.parametrize("name", BARRIERS)
+def test_a_narrow_barrier_reflects(name, width, method):
+    """A mass of energy 1/2 before a barrier of 1 returns, however narrow that is: its force is zero on its top."""
+    q = sv.coordinates("x y")
+    x, y = q
+    potential = BARRIERS[name]((x - 1.0) / width)
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=potential)
+    model = sv.derive(mechanism, sv.Program({"rail": y}, by="ideal"))
+    for place in (0.0, 0.1234):
+        run = sv.simulate(model, model.start(x=place, dx=1.0), (0.0, 3.0), method, t_eval=[0.0, 3.0])
+        assert run["dx"][-1] == pytest.approx(-1.0, abs=1e-7)
+        assert run["x"][-1] == pytest.approx(place - 1.0 - 2 * place, abs=4 * width)
