@@ -34,7 +34,7 @@ def lifted(expressions, unknowns):
     place = {s.element_hash(): k for k, s in enumerate(unknowns.elements())}
     free = [place.get(s.element_hash()) for s in tape.symbols]
     series = Series(tape, [[s if k is None else 0.0] for s, k in zip(tape.symbols, free, strict=True)])
-    series.advance(without=_moving(tape, free))
+    series.advance(without=_with_unknowns(tape, free))
     sums, forms, uses = [], [], _uses(tape)
     for i, node in enumerate(tape.nodes):
         form = {free[node.data]: 1.0} if node.kind == "input" else _form(node, forms, series.c)
@@ -51,7 +51,7 @@ def lifted(expressions, unknowns):
     return ca.SX.triplet(filled, columns, entries, len(rows), len(place) + len(sums))
 
 
-def _moving(tape, free):
+def _with_unknowns(tape, free):
     """The set of nodes that change with unknowns; `free` has for each input the index of an unknown, or None."""
     moving = set()
     for i, node in enumerate(tape.nodes):
