@@ -18,7 +18,7 @@ import numpy as np
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
-from servoctl.methods.flow import deviations
+from servoctl.methods.flow import defect, deviations, tangents
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.stability import stability_function
 from servoctl.model.model import Model
@@ -299,13 +299,13 @@ def quiet_by_series(model, run, last):
     x, size = _states(model, run), _sizes(model, run)
     if len(run.variants) > 1 or switching(model) is not None or not np.isfinite(x[:, [0, -1]]).all():
         return False
-    N, lost = _kernel(model, run.t[[0, -1]], x[:, [0, -1]], size)
-    between = np.linspace(run.t[0], run.t[-1], BLOCKS + 1)
-    moved = None if lost.any() else deviations(model, last, between, x[:, 0], run.knots, size, N[0])
+    between, idle = np.linspace(run.t[0], run.t[-1], BLOCKS + 1), int(np.count_nonzero(~model.active_states))
+    first = tangents(model, last, run.t[0], x[:, 0], size)
+    moved = None if first is None else deviations(model, last, between, x[:, 0], run.knots, size, first, idle)
     if moved is None or not _small(np.abs(moved.x - x[:, -1]), size):
         return False
     Q = moved.Q
-    if not _frobenius(Q[-1] - N[1] @ (N[1].T @ Q[-1])) <= DEFECT:
+    if not defect(model, last, run.t[-1], x[:, -1], size, Q[-1]) <= DEFECT:
         return False
     forward = np.sign(between[-1] - between[0])
     ends = np.searchsorted(forward * moved.t, forward * between)

@@ -241,7 +241,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
-    if run.success and not model.flat:
+    if run.success and not model.flat and not motion.drifted <= DRIFTED:
         _warn_drifted(run)
     return run
 
@@ -468,9 +468,8 @@ def _set_at_knots(t, jets, variants, knots):
         near = np.abs(t[first:end] - beside) <= SAME_TIME * np.maximum(1.0, np.abs(beside))
         at = first + np.flatnonzero(near.any(axis=0))
         if len(at):
-            n_x, top = len(model.state_names), len(model.jet_names)
-            rates = model.function("ode").grid(t[at], jets[:n_x, at], model.parameters)
-            jets[n_x:top, at] = rates[n_x - model.n : n_x]
+            top = len(model.jet_names)
+            jets[:top, at] = model.with_highest(t[at], jets[: len(model.state_names), at])
             if len(jets) > top:
                 jets[:, at] = model.extended(t[at], jets[:top, at], len(jets))
 
@@ -488,9 +487,8 @@ def _resample(run, times):
     for first, end, variant in run.variants or ((0, len(run.t), run.model),):
         inside = np.flatnonzero((steps >= first) & (steps < end))  # the variant of a step's end holds within the step
         if len(inside):
-            a, b, n_x, n = int(inside[0]), int(inside[-1]) + 1, len(variant.state_names), variant.n
-            rates = variant.function("ode").grid(times[a:b], jets[:n_x, a:b], variant.parameters)[n_x - n : n_x]
-            highest = jets[n_x : n_x + n, a:b]
+            a, b, n_x = int(inside[0]), int(inside[-1]) + 1, len(variant.state_names)
+            rates, highest = variant.with_highest(times[a:b], jets[:n_x, a:b])[n_x:], jets[n_x : n_x + variant.n, a:b]
             highest[:] = np.where(np.isfinite(highest), rates, highest)
             variants.append((a, b, variant))
     return replace(run, t=times, jets=jets, variants=tuple(variants))
@@ -547,9 +545,10 @@ def _scaled_residuals(model, t, x):
     """Names of the invariants, their values, and these relative to their gradients times the state."""
     names = [name for _, name in model.invariant_names()]
     y = model.function("invariants")(t, x, model.parameters)
-    values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names)).T
-    sizes = np.sqrt((slopes**2 * (1.0 + np.abs(x)) ** 2).sum(axis=1))
-    return names, values, np.nan_to_num(np.abs(values) / np.where(sizes > 0, sizes, 1.0))
+    values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names))
+    square = (1.0 + np.abs(x)) ** 2 @ slopes**2
+    off = np.abs(values) / np.sqrt(np.where(square > 0, square, 1.0))
+    return names, values, np.fmin(np.fmax(off, 0.0), np.finfo(float).max)
 
 
 def consistent_state(model, start, t):

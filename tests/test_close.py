@@ -11,6 +11,7 @@ from refusals import refused
 from scenes import CRANE, POINT, ROPE
 
 import servoctl as sv
+from servoctl.control import loop as sampled
 from servoctl.errors import InconsistentStart
 from servoctl.gallery import gallery
 
@@ -169,6 +170,39 @@ def test_pd_brings_the_actuated_displacements_back(crane_plan):
     assert u - ahead == pytest.approx([-2000.0 * 0.05 - 800.0 * 0.1, -5000.0 * 0.02], rel=1e-9)
     run = sv.close(sv.plant(CRANE, m_load=115.0), law, crane_plan.state(0.0), (0.0, 8.0))
     assert np.abs(run.error["x"]).max() < 0.05 and np.abs(run.error["l"]).max() < 0.05
+
+
+@pytest.mark.parametrize("rate", [100.0, 400.0, 1000.0])
+@pytest.mark.parametrize("actuator", ["trolley", "hoist"])
+def test_an_actuator_without_gains_is_not_called_unstable(crane_plan, actuator, rate):
+    """What it moves is a chain of two integrators: an eigenvalue 1 twice, which rounding moves by the root of 1e-16."""
+    law = sv.pd(crane_plan, sv.plant(CRANE), kp={actuator: 2000.0}, kd={actuator: 800.0}, rate=rate)
+    assert law.rate == rate
+
+
+@pytest.mark.parametrize("sensors", [None, sv.Sensors(quantisation={"dl": 1e-3})])
+@pytest.mark.parametrize("make", [
+    lambda plan, plant: sv.pd(plan, plant, kp={"trolley": 2000.0}, kd={"trolley": 800.0}),
+    lambda plan, plant: sv.pd(plan, plant, kp={"trolley": 2e3, "hoist": 5e3}, kd={"trolley": 8e2, "hoist": 15e2}),
+    sv.lqr, sv.feedforward,
+])  # fmt: skip
+def test_measurements_are_the_states_that_a_law_measures(crane_plan, make, sensors, monkeypatch):
+    """They are logged only where sensors alter them; the loop may pause after any step."""
+    plant, x0 = sv.plant(CRANE, m_load=110.0), crane_plan.state(0.0) + 0.01
+    law = make(crane_plan, plant)
+    sensors = sensors if "dl" in law.measures else None
+    run = sv.close(plant, law, x0, (0.0, 1.0), sensors=sensors)
+    assert list(run.measured) == list(law.measures)
+    for name, values in run.measured.items():
+        step = sensors.quantisation.get(name) if sensors else None
+        assert np.array_equal(values, run[name] if step is None else step * np.rint(run[name] / step))
+    monkeypatch.setattr(sampled, "FIRST_PIECE", 7)
+    monkeypatch.setattr(sampled, "PIECE", 1e-9)
+    paused = sv.close(plant, law, x0, (0.0, 1.0), sensors=sensors)
+    assert np.array_equal(paused.states, run.states) and np.array_equal(paused.measurements, run.measurements)
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    interpreted = sv.close(plant, law, x0, (0.0, 1.0), sensors=sensors)
+    assert interpreted.states == pytest.approx(run.states, abs=1e-10)
 
 
 def test_a_law_with_a_controller_state_is_started(crane_plan):

@@ -16,6 +16,7 @@ from servoctl.codegen import compiler, emit
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
 from servoctl.codegen.interpreted import MANY_POINTS, Interpreter
+from servoctl.codegen.machine import ENOUGH, TOGETHER, Machine
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.methods.runge_kutta import tableau
 
@@ -103,7 +104,10 @@ def test_every_operation_equals_casadi(monkeypatch, c_compiler):
             np.testing.assert_array_max_ulp(row, expected, maxulp=2)
 
 
-def test_operations_on_many_points_at_once_have_the_bits_of_single_points():
+@pytest.mark.parametrize("with_compiler", [True, False])
+def test_operations_on_many_points_at_once_have_the_bits_of_single_points(with_compiler, monkeypatch, c_compiler):
+    if not with_compiler:
+        monkeypatch.setenv("SERVOCTL_COMPILER", "none")
     expressions, x = every_operation()
     f, (a, b) = function(*expressions), X2.elements()
     guarded = function(ca.if_else(a > 0, b, 3.0), ca.copysign(2.0, 2.0) * a, a - a, 0.0, -0.0, T, x=X2)
@@ -117,6 +121,8 @@ def test_operations_on_many_points_at_once_have_the_bits_of_single_points():
             evaluator.grid(t, x, p, again)
         again[:] = np.inf
         evaluator.grid(t, x, p, again)
+        by_operations = with_compiler and not emit.contains(g, ca.OP_ERFINV)
+        assert isinstance(evaluator._lanes, Machine) == by_operations
         np.testing.assert_array_equal(again, once)
         zeros = once == 0
         np.testing.assert_array_equal(np.signbit(again[zeros]), np.signbit(once[zeros]))
@@ -130,6 +136,23 @@ def test_a_function_is_written_for_many_points_at_once_when_many_were_evaluated(
         evaluator.grid(t, x, p, y)
         made.append("_lanes" in vars(evaluator))
     assert made == [False, True, True]
+
+
+@pytest.mark.parametrize("n", [1, ENOUGH - 1, ENOUGH, TOGETHER - 1, TOGETHER, TOGETHER + 1, 3 * TOGETHER + ENOUGH])
+def test_a_list_of_operations_fills_what_it_is_given_and_no_more(n, c_compiler, monkeypatch):
+    calls, run = [], Machine.grid
+    monkeypatch.setattr(Machine, "grid", lambda self, t, *rest: (calls.append(t.size), run(self, t, *rest)))
+    g, rng = random_function(60), np.random.default_rng(n)
+    evaluator = Interpreter(g)
+    evaluator.grid(np.zeros(MANY_POINTS), np.zeros((2, MANY_POINTS)), np.zeros(1), np.empty((21, MANY_POINTS)))
+    t, x = rng.normal(size=n), rng.normal(size=(n, 2)).T  # the numbers of a point next to each other
+    around = np.full((n + 2, 23), np.pi)
+    evaluator.grid(t, x, np.array([0.3]), around[1:-1, 1:-1].T)
+    once = np.array([evaluator._value(t[k], x[:, k].copy(), np.array([0.3])) for k in range(n)])
+    np.testing.assert_array_equal(around[1:-1, 1:-1], once)
+    around[1:-1, 1:-1] = np.pi
+    assert np.all(around == np.pi)
+    assert calls == [MANY_POINTS] + [n] * (n >= ENOUGH)
 
 
 def test_constants_are_exact(monkeypatch, c_compiler):

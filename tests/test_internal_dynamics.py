@@ -19,7 +19,7 @@ import servoctl as sv
 from servoctl import growth, simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 from servoctl.growth import growth_bound
-from servoctl.methods.flow import MOST_ALONG, deviations
+from servoctl.methods.flow import MOST_ALONG, defect, deviations, tangents
 from servoctl.methods.taylor import last_index
 
 
@@ -498,6 +498,29 @@ def test_series_that_are_too_short_move_no_deviations():
     assert deviations(fast, 17, np.linspace(0.0, 8.0, 3), fast.start(x=0.0, dx=0.0).values, (), np.ones(4), Q) is None
     assert deviations(model, 17, np.linspace(0.0, 2e4, 33), x, (), np.ones(4), Q) is None
     assert deviations(model, 17, np.linspace(0.0, 8.0, MOST_ALONG + 2), x, (), np.ones(4), Q) is None
+
+
+@pytest.mark.parametrize("name", ["appell-hamel", "passive-arm", "pendubot"])
+def test_tangents_span_the_kernel_of_the_gradients(name, gallery_model):
+    model, scene = gallery_model(name), gallery[name]
+    x = model.start(**scene.start, guess=scene.guess).values
+    size = 1 + np.arange(float(len(x)))
+    Q, N = tangents(model, 12, 0.0, x, size), growth._kernel(model, np.zeros(1), x[:, None], size)[0][0]
+    assert Q @ Q.T == pytest.approx(N @ N.T, abs=1e-12) and defect(model, 12, 0.0, x, size, Q) < 1e-12
+    beyond = np.linalg.qr(np.column_stack([N, np.eye(len(x))]))[0][:, N.shape[1] :][:, :1]
+    assert defect(model, 12, 0.0, x, size, beyond) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_errors_of_states_on_which_nothing_depends_stay(gallery_model):
+    model = gallery_model("appell-hamel")
+    assert [name for name, active in zip(model.state_names, model.active_states, strict=True) if not active] == ["x", "y"]
+    assert gallery_model("pendubot").active_states.all()
+    x = model.start(x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5).values
+    size, cuts = 1 + np.arange(10.0), np.linspace(0.0, 10.0, 33)
+    Q = tangents(model, 18, 0.0, x, size)
+    moved, kept = (deviations(model, 18, cuts, x, (), size, Q, fixed) for fixed in (0, 2))
+    assert np.array_equal(moved.t, kept.t) and np.array_equal(kept.Q[:, :, :2], np.broadcast_to(Q[:, :2], (len(kept.t), 10, 2)))
+    assert kept.R == pytest.approx(moved.R, abs=1e-8) and kept.Q == pytest.approx(moved.Q, abs=1e-8)
 
 
 COMPARED = {

@@ -87,6 +87,12 @@ def test_pivots_of_definite_matrices_give_the_same_motion(which):
         assert relative(one, two) < 1e-10
 
 
+def test_where_actuators_reach_every_balance_no_pivot_chooses_among_these():
+    """Four torques and a bar: nothing is divided by a choice of balances, so none may stop a motion by vanishing."""
+    model, _ = begun("least torque beside a bar")
+    assert not [name for name, _ in model.reduction.pivots if "unreached" in name]
+
+
 @pytest.mark.parametrize("which", ["ideal", "least torque beside a bar"])
 def test_error_dynamics_are_the_same_with_them(which):
     model, start = begun(which)

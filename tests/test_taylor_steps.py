@@ -9,7 +9,7 @@ from scipy.interpolate import make_interp_spline
 import servoctl as sv
 from servoctl.codegen.interpreted import rough_log2
 from servoctl.gallery import gallery
-from servoctl.methods.taylor import series_loop
+from servoctl.methods.taylor import TaylorSteps, series_loop
 from servoctl.simulation import simulated
 
 
@@ -241,6 +241,32 @@ def test_matrices_have_the_velocities_that_rows_determine(span):
     moved[f.sizes["nq"] :] += 0.1 * (1 - np.array(f.sizes["free"]))
     assert f(span[0], moved, p) == pytest.approx(f(span[0], state, p), rel=1e-13, abs=1e-13)
     assert f.others["settled"](span[0], moved, p) == pytest.approx(f.others["settled"](span[0], state, p))
+
+
+ONE_CALL = {  # scene, span, samples
+    "wheel": ("appell-hamel", None, None),
+    "backwards": ("appell-hamel", (2.0, 0.0), None),
+    "few samples, backwards": ("appell-hamel", (2.0, 0.0), [0.5, 1.0, 1.5]),
+    "one sample": ("appell-hamel", (0.0, 2.0), [1.0]),
+    "no row determines velocities": ("pendubot", None, None),
+    "four coordinates": ("passive-arm", None, None),
+}
+
+
+@pytest.mark.parametrize("case", ONE_CALL)
+def test_a_motion_in_one_call_is_that_by_inspected_steps(case, gallery_model, monkeypatch):
+    name, span, times = ONE_CALL[case]
+    model, scene, calls = gallery_model(name), gallery[name], []
+    span = scene.t_span if span is None else span
+    start = model.start(t=span[0], **scene.start, guess=scene.guess)
+    real = TaylorSteps._in_one_call
+    monkeypatch.setattr(TaylorSteps, "_in_one_call", lambda *a: calls.append(real(*a)) or calls[-1])
+    whole = sv.simulate(model, start, span, "Taylor", t_eval=times)
+    monkeypatch.setattr(TaylorSteps, "_in_one_call", lambda *a: False)
+    inspected = sv.simulate(model, start, span, "Taylor", t_eval=times)
+    assert any(calls) == (name != "passive-arm")  # whose path is flat at the start, so that its first step is too long
+    assert np.array_equal(whole.t, inspected.t) and np.array_equal(whole.jets, inspected.jets)
+    assert whole == inspected and whole.counters == inspected.counters and whole.internal == inspected.internal
 
 
 @pytest.mark.parametrize("forward", [True, False])

@@ -7,6 +7,7 @@ of a function that is called often are compiled too, with CasADi's operations on
 """
 
 import functools
+import itertools
 import os
 
 import casadi as ca
@@ -45,7 +46,8 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     sizes : dict of str to int or tuple of int, optional
         Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers
         of coordinates "nq" and of quasi-velocities "n", the order s̄ "top", the highest index of coefficients "last",
-        "plain" (1 if q' = γ', else 0), and, beside a function "settled" of `others`, (t, x, p) -> (x, γ^(s̄)),
+        "plain" (1 if q' = γ', else 0), for `whole` with functions "rates" and "invariants" of `others` the number of
+        outputs "rates" and of values "invariants", and, beside a function "settled" there, (t, x, p) -> (x, γ^(s̄)),
         "free": a tuple of 0 for each entry of γ', ..., γ^(s̄-1) that this function gives, of 1 for those integrated.
 
     Returns
@@ -430,6 +432,49 @@ class Compiled:
         every = project_every if self._project is not None else 0
         atol, weights = weighted(atol)
         return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
+
+    def whole(self, start, p, tolerances, most, times, net):
+        """A whole motion by the Taylor method in one call, with what shows whether nothing along it needs a decision.
+
+        Parameters
+        ----------
+        start : (t0, (n_x,) array, t1)
+            Start [s], the state there, and the end [s].
+        p : (n_p,) array
+        tolerances : (rtol, atol)
+            As for `taylor`.
+        most : int
+            Largest number of steps.
+        times : (N,) array
+            Samples in the order of the motion [s].
+        net : ((M,) array, float)
+            Where series are compared with the equations: parts of each step, and a distance of instants [s].
+
+        Returns
+        -------
+        steps : int
+        jets : (nq + s̄ n, N) array
+            q, γ', ..., γ^(s̄) at the samples, by "settled" if there is one.
+        facts : list of arrays
+            How far γ^(s̄) of the series is from that of "rates" (n,), the longest step (1,), the largest sizes of the
+            states (n_x,) and, after the start, of "invariants" (m,), the least size of each pivot, 0 where its sign
+            changes, and the largest one, the outputs of "invariants" at the start, and (1,) the largest of them at the
+            end, relative to its gradient times the state.
+        None
+            If the steps do not reach the end, or nothing is compiled.
+        """
+        self._require_loop("taylor")
+        self._place(self._library, start[0], start[1], p)
+        n, m, sizes = self.sizes["n"], self.sizes["invariants"], self.sizes
+        pivots = self.n_y - sizes["last"] * (n + (0 if sizes["plain"] else sizes["nq"]))
+        lengths = n, 1, self.n_x, m, pivots, pivots, m * (1 + self.n_x), 1
+        rows = sizes["nq"] + sizes["top"] * n
+        times = np.ascontiguousarray(times, dtype=float)
+        found = self._library.whole(start[2], tolerances, most, times, net, (rows, sum(lengths)))
+        if found is None:
+            return None
+        ends = list(itertools.accumulate(lengths, initial=0))
+        return *found[:2], [found[2][a:b] for a, b in itertools.pairwise(ends)]
 
     def jets(self, log, k, t, p, levels, by_rows=False):
         """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.

@@ -22,6 +22,7 @@ from servoctl.codegen.loops import (
     SHORTEST,
     STEADY,
 )
+from servoctl.codegen.machine import ENOUGH, Machine, machine
 
 BLOCK = 128  # instants of a path that are solved together
 MANY_POINTS = 2_000  # CasADi has taken as long for them, one by one, as writing the function for a block at once takes
@@ -139,6 +140,11 @@ class Interpreter:
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
         left, self._points = t.size % BLOCK, self._points + t.size
         lanes = self._lanes if self._points >= MANY_POINTS else None
+        if isinstance(lanes, Machine):
+            if t.size >= ENOUGH:
+                lanes.grid(t, x, p, y)
+                return
+            lanes = None
         least = BLOCK // 8 if lanes else BLOCK // 2  # a block with as many points is faster than these one by one
         blocks = t.size - left * (left < least)
         if t.size < BLOCK and not lanes and "_blocks" not in vars(self):  # making them takes longer; same bits
@@ -162,6 +168,9 @@ class Interpreter:
 
     @functools.cached_property
     def _lanes(self):
+        """Evaluation of many points: by the `Machine`, else by CasADi; None where tables are looked up."""
+        if (by_operations := machine(self._f)) is not None:
+            return by_operations
         f = side_by_side(self._f, BLOCK)
         return None if f is None else Blocks(f, self._parts, "C")
 
@@ -228,6 +237,9 @@ class Interpreter:
             if every and len(rows) % every == 0:
                 x = self._restore(t, self._settle(t, x, p), p)
         return np.array([*rows, np.concatenate([[t], x, np.zeros(len(self.workspace.row[3]))])])
+
+    def whole(self, *_):
+        """None: without a compiler a motion is no single call."""
 
     def jets(self, log, k, t, p, counts, z):
         """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""

@@ -70,6 +70,26 @@ class Library:
         run.restype = ctypes.c_int64
         return run
 
+    def whole(self, t1, tolerances, most, times, net, sizes):
+        """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
+        workspace, (inside, distance), count = self.workspace, net, len(times)
+        workspace.log(most + 1, self._columns)
+        task, end = workspace.task, np.array([t1])
+        workspace.until(end)
+        workspace.weigh(None)
+        (task[1], task[2]), task[3], task[4] = tolerances, 0.0, most
+        jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
+        samples = np.array([count, len(inside), 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
+        samples.view(float)[2] = distance
+        steps = self._whole(workspace.pointer, argument(samples))
+        return (steps, jets, facts) if steps >= 0 else None
+
+    @functools.cached_property
+    def _whole(self):
+        run = self.native("whole")
+        run.restype = ctypes.c_int64
+        return run
+
     def jets(self, log, k, t, p, counts, z):
         """Fill z with the jets at times t in the steps k of a log; see `Compiled.jets`."""
         size, (levels, settled) = ctypes.c_int64(t.size), map(ctypes.c_int64, counts)

@@ -25,7 +25,7 @@ STILL = 1e-9  # change of a shape over the motion below which it is the ground, 
 BORDER = 0.06  # around the motion, of the picture's larger side
 ACROSS, UP = 6.4, 5.6  # inches, of the picture's plane
 TRIAD, ARROW = (0.32, 0.15), 0.33  # place and length of the directions of space [inches]
-ASIDE = 0.75  # width of the directions of space, which poses side by side leave free [inches]
+FOR_DIRECTIONS = 0.75  # width of the directions of space, which poses side by side leave free [inches]
 SLIM = 0.12  # ratio of the sides below which poses would hide each other
 COVERED = 0.5  # part of two poses together that both cover, above which they hide each other
 GAP = 0.35  # between poses side by side, of the larger side of a pose
@@ -308,7 +308,7 @@ def _side_by_side(picture, each, ax, title):
     parts = {f"{n} {k}": v[:, : k * each + 1] + place[:, [k]] for n, v in picture.trails.items() for k in range(count)}
     ax = _axes(replace(picture, t=picture.t[at], shapes=shapes, trails=parts, programmed={}), ax, title)
     (left, right), inches = ax.get_xlim(), ax.figure.get_size_inches()[0]
-    ax.set_xlim(left - (right - left) * ASIDE / max(inches - ASIDE, ASIDE), right)
+    ax.set_xlim(left - (right - left) * FOR_DIRECTIONS / max(inches - FOR_DIRECTIONS, FOR_DIRECTIONS), right)
     for path in parts.values():
         ax.plot(*path, color=POINT, linewidth=1.6, zorder=3)
     for k, t in enumerate(picture.t[at]):

@@ -374,7 +374,7 @@ def as_text(f):
     -------
     str
     """
-    if not any(f.instruction_id(k) == ca.OP_CALL for k in range(f.n_instructions())):
+    if not made or not any(f.instruction_id(k) == ca.OP_CALL for k in range(f.n_instructions())):
         return f.serialize()
     outputs = f.call(f.sx_in())
     values, marks = _marked([e for y in outputs for e in y.nonzeros()])

@@ -89,10 +89,10 @@ class Series:
         """The coefficients of each output so far (list of lists)."""
         return [self.c[node] for node in self.tape.outputs]
 
-    def advance(self):
-        """Compute the next coefficient of every node."""
+    def advance(self, without=()):
+        """Compute the next coefficient of every node but some, on which no other node depends."""
         for i, node in enumerate(self.nodes):
-            self.c[i].append(self._coefficient(node, i, self.k))
+            self.c[i].append(None if i in without else self._coefficient(node, i, self.k))
         self.k += 1
 
     def replace_last(self, coefficients):

@@ -139,11 +139,10 @@ def _left_out(span, window, times):
 
 def _to_event(problem, events, solution, times):
     """The samples (N,) up to a terminal event of a motion, and its name; all of them and "" without one."""
-    model, n_x = problem.model, problem.n_x
+    model = problem.model
 
     def jets(t):
-        x = problem.at(t, *solution)
-        return np.vstack([x, model.function("ode").grid(t, x, problem.p)[n_x - model.n : n_x]])
+        return model.with_highest(t, problem.at(t, *solution), problem.p)
 
     t = events.instants(np.union1d(times, solution[0]))[1]
     found = events.first(model, t, jets(t), lambda s: jets(np.array([s]))[:, 0])

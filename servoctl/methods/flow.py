@@ -76,7 +76,8 @@ class Deviations:
             Both are None where propagators are not moderate.
         """
         n, (free, n_x) = len(self.cuts), self.start.shape
-        sizes = 3 * (n + 1) * free**2, n_x * (free * (free + n + 2) + n_x + 2), n * (free + 2 * n + 2)
+        rows, row = 8 * -(-n_x // 8), 8 * -(-free // 8)  # padded to whole vectors
+        sizes = free * (3 * n * free + 4 * row + n * n_x), rows * (free * (free + 2) + n_x + 2), n * (free + 2 * n + 2)
         settings, work = np.array(settings), np.empty(sum(sizes))
         logs, scale = np.full((n, n), -np.inf), np.empty(n_x)
         steps, n_x, n, free = map(ctypes.c_int64, (len(self.log), n_x, n, free))
@@ -85,7 +86,54 @@ class Deviations:
         return (logs, scale) if found else (None, None)
 
 
-def deviations(model, last, t, x, knots, size, Q):
+def tangents(model, last, t, x, size):
+    """Orthonormal deviations in the tangent space of the invariants, in the sizes of the states.
+
+    Parameters
+    ----------
+    model : Model
+    last : int
+        As for `deviations`.
+    t : float
+        [s]
+    x : (n_x,) array
+    size : (n_x,) array
+
+    Returns
+    -------
+    (n_x, f) array or None
+        First the unit vectors of states that are not active (`Model.active_states`). None where nothing is compiled,
+        or gradients are dependent or not finite.
+    """
+    call, f = series_loop(model, last).native("tangents"), len(x) - len(model.invariant_names())
+    if call is None:
+        return None
+    call.restype, Q = ctypes.c_int64, np.empty((f, len(x)))
+    return Q.T if call(*_place(model, t, x, size), ctypes.c_int64(f), pointer(Q)) else None
+
+
+def defect(model, last, t, x, size, Q):
+    """How far deviations Q (n_x, f) are from the tangent space at t and x, as `tangents`, in Frobenius' norm."""
+    call, Q, result = series_loop(model, last).native("defect"), np.ascontiguousarray(Q.T), np.empty(1)
+    call.restype = None
+    call(*_place(model, t, x, size), ctypes.c_int64(len(Q)), pointer(Q), pointer(result))
+    return float(result[0])
+
+
+def _place(model, t, x, size):
+    """Pointers to t, x, p, the sizes and the active states; the arrays live as long as they."""
+    arrays = [np.array([t]), x, np.append(model.parameters, t), size, model.active_states]
+    return [_pointer_to(np.ascontiguousarray(array, dtype=float)) for array in arrays]
+
+
+def _pointer_to(array):
+    """`pointer`, which holds its array."""
+    place = pointer(array)
+    place.array = array
+    return place
+
+
+def deviations(model, last, t, x, knots, size, Q, fixed=0):
     """How deviations move along a motion.
 
     Parameters
@@ -104,6 +152,8 @@ def deviations(model, last, t, x, knots, size, Q):
         Sizes of the states.
     Q : (n_x, f) array
         Orthonormal deviations at the first instant.
+    fixed : int
+        The first of them that stay, as nothing depends on the states in them.
 
     Returns
     -------
@@ -120,9 +170,9 @@ def deviations(model, last, t, x, knots, size, Q):
     for a, b in pairwise(breakpoints((t[0], t[-1]), knots)):
         p = np.append(model.parameters, (a + b) / 2)
         inside = np.concatenate([[a], t[(forward * t > forward * a) & (forward * t < forward * b)], [b]])
-        counts = ctypes.c_int64(len(inside)), ctypes.c_int64(free), ctypes.c_int64(MOST_ALONG - taken)
-        given = (counts[0], *map(pointer, (inside, x, p, settings)), counts[1], *map(pointer, (size, moved)))
-        steps = run(*given, counts[2], pointer(log[taken:]))
+        count, *counts, most = map(ctypes.c_int64, (len(inside), fixed, free, MOST_ALONG - taken))
+        given = (count, *map(pointer, (inside, x, p, settings)), *counts, *map(pointer, (size, moved)))
+        steps = run(*given, most, pointer(log[taken:]))
         if steps < 0:
             return None
         taken += steps

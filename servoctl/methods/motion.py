@@ -43,6 +43,7 @@ class Motion:
     switches: list = field(default_factory=list)
     start: object = None  # X at t0, if it is not the given one
     room: int = 0  # samples of the whole motion
+    drifted: float = np.nan  # largest residual at t1, relative to its gradient times the state; NaN if it is not known
     largest: float | np.ndarray = 0.0  # magnitudes (n_x,) of X at the ends of steps
     _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _jets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -78,6 +79,10 @@ class Motion:
             self._jets[row : row + len(level), start:end] = level[:, new]
             row += len(level)
         self.pieces.append((model, start - shared, start, end))
+
+    def fill(self, model, t, jets):
+        """Set all samples t (N,) and jets (n_z, N), computed with one variant of the model."""
+        self.pieces, self._t, self._jets = [(model, 0, 0, len(t))], np.array(t), jets
 
     def _reserve(self, room, rows):
         """Make room for samples; the system gives memory as they fill it."""

@@ -1,12 +1,20 @@
 """How large the entries of a state are along a motion, in the metric of the inertia."""
 
+from functools import cache
+
 import numpy as np
+
+from servoctl.values import read_only
 
 
 def state_levels(model):
     """Level of each entry of the state X: 0 for q, k for γ^(k); (n_x,) array of int."""
-    n_x, nq, n = len(model.state_names), model.nq, model.n
-    return np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n)
+    return _levels(len(model.state_names), model.nq, model.n)
+
+
+@cache
+def _levels(n_x, nq, n):
+    return read_only(np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n))
 
 
 def motion_sizes(model, t, x):

@@ -7,6 +7,7 @@ motion by one solve with the same L.
 
 from bisect import bisect_right
 from dataclasses import dataclass, replace
+from functools import cache
 from math import factorial, perm
 
 import casadi as ca
@@ -20,10 +21,10 @@ from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
-from servoctl.methods.monitor import DenseStretch, Fine, Repivot
-from servoctl.methods.motion import Stepping
+from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
+from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import RESOLUTION, End, net, steps_of
+from servoctl.methods.watch import LEAVES, RESOLUTION, End, Tolerance, net, steps_of
 from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
@@ -351,6 +352,8 @@ def series_loop(model, last):
         if solved:
             free = (int(i not in solved.get(k, ((), (), ()))[1]) for k in range(1, e.top) for i in range(q.n))
             sizes, others = sizes | {"free": tuple(free)}, {"settled": settled(e)}
+        others |= {name: model.function(given).expression for name, given in (("rates", "ode"), ("invariants",) * 2)}
+        sizes |= {"invariants": len(model.invariant_names()), "rates": others["rates"].numel_out(0)}
         f = taylor_coefficients(e, last)
         return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), others=others, sizes=sizes)
 
@@ -371,6 +374,17 @@ def last_index(model, method):
     top = model.reduction.top
     order = order_for(method.rtol) if method.order is None else method.order
     return max(order + top - 1, max(method.jets or 0, top) + 1)
+
+
+@cache
+def _integrated_levels(free, n):
+    """Entries of γ by the highest level at which they are integrated, 0 where only q is.
+
+    `free` are 1 for each entry of γ', ..., γ^(s̄-1) that is integrated, else 0.
+    """
+    levels = np.array(free).reshape(-1, n)
+    highest = (levels * np.arange(1, len(levels) + 1)[:, None]).max(axis=0)
+    return {int(level): np.flatnonzero(highest == level) for level in np.unique(highest)}
 
 
 class Unsuited(Exception):
@@ -428,7 +442,42 @@ class TaylorSteps(Stepping):
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
-        self.integrated = self._integrated_levels()
+
+    def run(self, t0, x0, t1, t_eval, knots):
+        """Integrate as `Stepping.run`: in one compiled call where nothing along the motion needs a decision."""
+        with interruptible(self.motion):
+            if self._in_one_call(t0, x0, t1, t_eval, knots):
+                return self.motion
+        return self.motion if self.motion.interrupted else super().run(t0, x0, t1, t_eval, knots)
+
+    def _in_one_call(self, t0, x0, t1, t_eval, knots):
+        """Take a motion whose steps, pivots and residuals are all in order; False if one of them must be inspected."""
+        model, watched = self.model, (self.family, self.events, arguments(self.model))
+        inside = len(breakpoints((t0, t1), knots)) > 2
+        plain = not (inside or self.every or self.settings.jets) and np.ndim(self.tolerances[1]) == 0
+        if not plain or any(what is not None for what in watched):
+            return False
+        p, net = np.append(model.parameters, (t0 + t1) / 2), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT))
+        whole = self.f.whole((t0, x0, t1), p, self.tolerances, self.most, t_eval, net)
+        if whole is None or whole[0] == self.most:
+            return False
+        steps, jets, (farthest, longest, states, residuals, least, most, first, drifted) = whole
+        if "settled" not in self.f.others:
+            top = self.rates.grid(t_eval, jets[: self.n_x], model.parameters)[self.n_x - self.n : self.n_x]
+            farthest = np.maximum(farthest, np.abs(top - jets[-self.n :]).max(axis=1, initial=0.0))
+            jets[-self.n :] = top
+        if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(jets).all():
+            return False
+        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any():
+            return False
+        slopes, tolerance = first[len(residuals) :].reshape(self.n_x, -1).T, Tolerance(model, *self.tolerances)
+        if not (residuals <= LEAVES * tolerance.of(slopes[:, :, None], x0[:, None])[:, 0]).all():
+            return False
+        self.motion.fill(model, t_eval, jets)
+        self.motion.largest, self.motion.drifted = states, float(drifted[0])
+        self.motion.count(steps=steps, nfev=steps)
+        self.progress(t1)
+        return True
 
     def _ends(self, cuts):
         """The end alone: the compiled loop ends steps at knots."""
@@ -531,34 +580,40 @@ class TaylorSteps(Stepping):
         k, at = self._instants(log)
         jets = log.jets(k, at, self.top)
         rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
-        rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
         off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
+        rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
         h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
-        longest = h.max()
-        for level, entries in self.integrated.items():
-            raised, part = self.top - level, perm(last, level) / perm(last, self.top - 1)
-            state, missed, highest = np.abs(log.states[self._level(level)]), off[entries], top[entries]
+        farthest, states = off.max(axis=1), np.abs(log.states).max(axis=1)
+        for level, (entries, largest) in self._far_off(farthest, h.max(), states).items():
+            part, missed, highest = perm(last, level) / perm(last, self.top - 1), off[entries], top[entries]
             if weights is not None and (level or self.plain):
-                w = weights[self._level(level), None]
-                state, missed, highest = w * state, w[entries] * missed, w[entries] * highest
-            largest = state.max()
-            if longest**raised * part * missed.max() <= FAR_OFF * (atol + rtol * largest):
-                continue
-            part = h[k] ** raised * part
+                w = weights[self._level(level), None][entries]
+                missed, highest = w * missed, w * highest
+            part = h[k] ** (self.top - level) * part
             sizes = np.maximum(largest, (part * highest).max(axis=0))
             error = (part * missed).max(axis=0)
             wrong |= (error > FAR_OFF * (atol + rtol * sizes)) & (h[k] > SMALLEST * span)
         return int(k[wrong].min(initial=len(t) - 1))
 
+    def _far_off(self, farthest, longest, states):
+        """Levels at which series may miss the equations: entries of γ, and the largest state of the level.
+
+        `farthest` (n,) is how far γ^(s̄) is off at most, `longest` the longest step, `states` (n_x,) the largest states.
+        """
+        rtol, (atol, weights), last, result = self.tolerances[0], weighted(self.tolerances[1]), self.f.sizes["last"], {}
+        for level, entries in _integrated_levels(self.f.sizes.get("free", (1,) * (self.n_x - self.nq)), self.n).items():
+            raised, part = self.top - level, perm(last, level) / perm(last, self.top - 1)
+            state, missed = states[self._level(level)], farthest[entries]
+            if weights is not None and (level or self.plain):
+                w = weights[self._level(level)]
+                state, missed = w * state, w[entries] * missed
+            if not longest**raised * part * missed.max() <= FAR_OFF * (atol + rtol * state.max()):
+                result[level] = entries, state.max()
+        return result
+
     def _level(self, level):
         """The places in the state of q, or of γ^(level)."""
         return slice(self.nq + (level - 1) * self.n, self.nq + level * self.n) if level else slice(0, self.nq)
-
-    def _integrated_levels(self):
-        """Entries of γ by the highest level at which they are integrated, 0 where only q is."""
-        free = np.array(self.f.sizes.get("free", [1] * (self.n_x - self.nq))).reshape(self.top - 1, self.n)
-        highest = (free * np.arange(1, self.top)[:, None]).max(axis=0)
-        return {int(level): np.flatnonzero(highest == level) for level in np.unique(highest)}
 
     def _instants(self, log):
         """Steps and instants within them at which series are compared with the equations."""

@@ -123,11 +123,9 @@ class Tolerance:
 
     def _sizes(self, x):
         """The largest size of each entry's level so far, (n_x, N)."""
-        sizes = np.maximum(np.nan_to_num(np.abs(x)), self.sizes[:, None])
-        for level in range(self.levels[-1] + 1):
-            same = self.levels == level
-            sizes[same] = sizes[same].max(axis=0)
-        return np.maximum.accumulate(sizes, axis=1)
+        sizes = np.fmin(np.fmax(np.abs(x), self.sizes[:, None]), np.finfo(float).max)
+        first = np.searchsorted(self.levels, range(self.levels[-1] + 1))
+        return np.maximum.accumulate(np.maximum.reduceat(sizes, first)[self.levels], axis=1)
 
 
 class Switches:

@@ -529,6 +529,27 @@ class Model(Shown):
             groups |= dict.fromkeys(rates, "coordinate_rates")
         return groups
 
+    def with_highest(self, t, states, p=None):
+        """The jets of a motion from its states: with the derivatives that the model determines.
+
+        Parameters
+        ----------
+        t : (N,) array
+            [s]
+        states : (n_x, N) array
+        p : (n_p,) or (n_p, N) array, optional
+            Parameters; default: those of the model.
+
+        Returns
+        -------
+        (n_z, N) array
+        """
+        (n_x, n), p = (len(self.state_names), self.n), self.parameters if p is None else p
+        if not self.flat:
+            return np.concatenate([states, self.function("ode").grid(t, states, p)[n_x - n : n_x]])
+        first = self.nq if self.reduction.mechanism.q.plain else 3 * self.nq
+        return np.concatenate([states, self.function("path").grid(t, states[: self.nq], p)[first + n : first + 2 * n]])
+
     def extended(self, t, jets, size):
         """Jets of a motion beyond those known, from derivatives of its rows (`reduction.manifold.solve`).
 
@@ -625,6 +646,17 @@ class Model(Shown):
     def pivot_sizes(self):
         """Largest size of each pivot at the points where the pivots were chosen, (n_g,) array."""
         return self.once("pivot sizes", lambda: self.equations.pivot_sizes)
+
+    @cached_property
+    def active_states(self):
+        """Which states (n_x,) the rates or the invariants depend on: errors in the others stay as they are."""
+
+        def build():
+            parts = (self.function(name).expression.jac_sparsity(0, 1) for name in ("ode", "invariants"))
+            rates, invariants = (np.array(ca.DM.ones(part)) for part in parts)
+            return np.concatenate([rates[: len(self.state_names)], invariants]).any(axis=0)
+
+        return self.once("active states", build)
 
     @cached_property
     def column_sizes(self):

@@ -45,8 +45,9 @@ def needed(mechanism, program, keep=(), named=()):
     roots = mechanism.places(*program.residuals.values(), *chosen, *mechanism.outputs.values())
     roots = roots.union(*map(mechanism.driven, mechanism.actuators), mechanism.places(*mechanism.reported.values()))
     roots |= {place for name, place in _jets(q).items() if name in keep or name in named}
-    reached = _reached(roots, mechanism.couplings())
-    all_play = not reached or len(reached) == q.nq + q.n
+    every = q.nq + q.n
+    reached = roots if len(roots) == every else _reached(roots, mechanism.couplings())
+    all_play = not reached or len(reached) == every
     return mechanism.part(reached) if not all_play and _others_are_regular(mechanism, reached) else mechanism
 
 

@@ -172,8 +172,10 @@ class Switches:
     def ends_of_pieces(self, values, span):
         """Ascending instants within a span at which the coefficients from tables change, an array."""
         tables = [(a, b) for a, b in self.timed if self._is_table(b)]
-        pieces, instants = [], [np.empty(0)]
-        for node in self.tape.nodes if tables else ():
+        if not tables:
+            return np.empty(0)
+        pieces, instants = [], []
+        for node in self.tape.nodes:
             pieces.append(self._pieces(node, pieces, values))
         for a, b in tables:
             knots, affine = self.tape.nodes[b].data.numbers, pieces[a] is not None

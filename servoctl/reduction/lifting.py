@@ -34,7 +34,7 @@ def lifted(expressions, unknowns):
     place = {s.element_hash(): k for k, s in enumerate(unknowns.elements())}
     free = [place.get(s.element_hash()) for s in tape.symbols]
     series = Series(tape, [[s if k is None else 0.0] for s, k in zip(tape.symbols, free, strict=True)])
-    series.advance()
+    series.advance(without=_with_unknowns(tape, free))
     sums, forms, uses = [], [], _uses(tape)
     for i, node in enumerate(tape.nodes):
         form = {free[node.data]: 1.0} if node.kind == "input" else _form(node, forms, series.c)
@@ -46,11 +46,18 @@ def lifted(expressions, unknowns):
             form = {len(place) + len(sums) - 1: 1.0}
         forms.append(form)
     rows = [*(forms[i] for i in tape.outputs), *sums]
-    matrix = ca.SX(len(rows), len(place) + len(sums))
-    for i, form in enumerate(rows):
-        for j, factor in form.items():
-            matrix[i, j] = factor
-    return matrix
+    filled, columns = [i for i, form in enumerate(rows) for _ in form], [j for form in rows for j in form]
+    entries = ca.vertcat(ca.SX(0, 1), *(factor for form in rows for factor in form.values()))
+    return ca.SX.triplet(filled, columns, entries, len(rows), len(place) + len(sums))
+
+
+def _with_unknowns(tape, free):
+    """The set of nodes that change with unknowns; `free` has for each input the index of an unknown, or None."""
+    moving = set()
+    for i, node in enumerate(tape.nodes):
+        if free[node.data] is not None if node.kind == "input" else not moving.isdisjoint(node.args):
+            moving.add(i)
+    return moving
 
 
 def _form(node, forms, c):

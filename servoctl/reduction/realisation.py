@@ -140,6 +140,7 @@ def _shared(mechanism, program, constraints, independent, points, context):
     unreached, of_split = reached.dynamics(mechanism.balance)
     rows = [*constraints, *(row for row, _ in settle_alone(q, balances(q, unreached), context))]
     rows, _, points, pivots = complete(q, rows, context, points)
+    of_split = of_split if reached.independent else []  # nothing is divided where all balances are reached
     pivots = [*((f"choice of unreached balances {i}", p) for i, p in enumerate(of_split, 1)), *pivots]
     P, L = _determined_rows(mechanism, rows, material, points, k)
     A = _inverse_weights(mechanism, program) @ P.T if program.metric == "actuators" else _inertial(mechanism, L)

@@ -79,7 +79,7 @@ class Signals(Mapping):
         """A function of the jets, or the highest of these, (n, K, N) for some motions."""
         count = len(part)
         t, p = np.repeat(self._t, count), np.tile(self._parameters[:, part], len(self._t))
-        jets = with_highest(self._model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
+        jets = self._model.with_highest(t, self._states[:, :, part].reshape(len(self._states), -1), p)
         y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
         return y.reshape(len(y), len(self._t), count)
 
@@ -90,16 +90,7 @@ class Signals(Mapping):
             return self._runs.get(i)
         values = dict(zip(self._model.numbers, self._parameters[:, i].tolist(), strict=True))
         model = self._model.with_parameters(**values)
-        jets = with_highest(model, self._t, states, model.parameters)
+        jets = model.with_highest(self._t, states)
         if len(self._jet_names) > len(jets):
             jets = model.extended(self._t, jets, len(self._jet_names))
         return Run(self._t, jets, self._jet_names, model)
-
-
-def with_highest(model, t, states, p):
-    """The jets (n_z, N) of states (n_x, N) at times (N,), with the derivatives that the model determines."""
-    n, n_x = model.n, len(states)
-    if not model.flat:
-        return np.concatenate([states, model.function("ode").grid(t, states, p)[n_x - n : n_x]])
-    first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq
-    return np.concatenate([states, model.function("path").grid(t, states[: model.nq], p)[first + n : first + 2 * n]])

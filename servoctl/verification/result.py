@@ -113,7 +113,8 @@ def judged(numbers, limits, notes=(), doubts=()):
 
 def largest(values):
     """The largest magnitude; infinite if a value is NaN."""
-    return float(np.nan_to_num(np.abs(values), nan=np.inf, posinf=np.inf).max(initial=0.0))
+    most = float(np.abs(values).max(initial=0.0))
+    return np.inf if np.isnan(most) else most
 
 
 def numbers(value, dimensions):

@@ -743,6 +743,8 @@ def _excused(errors, size, limit, rounding):
 
 def _ratio(errors, sizes):
     """Errors relative to sizes; zero errors of zero size are zero."""
+    if np.all(sizes > 0):
+        return errors / sizes
     sizes = np.broadcast_to(sizes, np.shape(errors))
     return np.divide(errors, sizes, out=np.where(errors == 0, 0.0, np.inf), where=sizes > 0)
 

@@ -34,74 +34,88 @@ static inline void inverse(int64_t F, const double *A, double *B)
 /* d that makes the sum of W_ij d_j^2/d_i^2 smallest, as `_balance` of growth.py. */
 static void balance(int64_t n_x, const double *W, const Settings *settings, double *scale, double *work)
 {
-    double *square = work, *ratios = work + n_x;
-    for (int64_t i = 0; i < n_x; i++) square[i] = 1;
+    double *square = work, *ratios = work + n_x, *inverses = ratios + n_x;
+    for (int64_t i = 0; i < n_x; i++) square[i] = inverses[i] = 1;
     for (int64_t sweep = 0; sweep < settings->sweeps; sweep++) {
         double most = 1;
         for (int64_t i = 0; i < n_x; i++) {
             double row = 0, column = 0;
             for (int64_t j = 0; j < n_x; j++) {
                 row += W[i * n_x + j] * square[j];
-                column += W[j * n_x + i] / square[j];
+                column += W[j * n_x + i] * inverses[j];
             }
-            row /= square[i];
+            row *= inverses[i];
             column *= square[i];
             ratios[i] = row > settings->tiny && column > settings->tiny ? row / column : 1;
             most = fmax(most, fmax(ratios[i], 1 / ratios[i]));
         }
         if (log(most) < settings->balanced) break;
-        for (int64_t i = 0; i < n_x; i++) square[i] *= sqrt(sqrt(ratios[i]));
+        for (int64_t i = 0; i < n_x; i++) {
+            square[i] *= sqrt(sqrt(ratios[i]));
+            inverses[i] = 1 / square[i];
+        }
     }
     for (int64_t i = 0; i < n_x; i++) scale[i] = sqrt(square[i]);
 }
 
+/* Rows are padded with zeros to whole vectors, which the compiler adds without looking at their number. */
+#define PADDED(n) (((n) + 7) / 8 * 8)
+static inline void add(int64_t n, double factor, const double *restrict from, double *restrict to)
+{
+    for (int64_t i = 0; i < n; i += 8) for (int64_t j = 0; j < 8; j++) to[i + j] += factor * from[i + j];
+}
+
 /* ln of the norm of an upper triangular Y (F, F), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest
-   eigenvalue F times at most; of a norm below `least` fewer squarings do, as they bound it. work has 2 F^2 numbers. */
+   eigenvalue F times at most; of a norm below `least` fewer squarings do, as they bound it. work has 3 F PADDED(F). */
 static double log_norm(int64_t F, const double *Y, double squarings, double least, double *work)
 {
-    double *G = work, *square = work + F * F, result = 0, part = 0.5;
-    for (int64_t i = 0; i < F; i++) for (int64_t j = i; j < F; j++) {
-        double sum = 0;
-        for (int64_t k = 0; k <= i; k++) sum += Y[k * F + i] * Y[k * F + j];
-        G[i * F + j] = G[j * F + i] = sum;
+    const int64_t S = PADDED(F);
+    double *G = work, *square = G + F * S, *rows = square + F * S, result = 0, part = 0.5;
+    for (int64_t i = 0; i < F * S; i++) G[i] = 0;
+    for (int64_t k = 0; k < F; k++) {
+        for (int64_t i = 0; i < S; i++) rows[i] = i < F ? Y[k * F + i] : 0;
+        for (int64_t i = k; i < F; i++) add(S, rows[i], rows, G + i * S);
     }
     for (int squaring = 0; ; squaring++, part /= 2) {
         double trace = 0;
-        for (int64_t i = 0; i < F; i++) trace += G[i * F + i];
-        result += part * log(trace);
-        if (squaring >= squarings || result < least) return result;
-        for (int64_t i = 0; i < F * F; i++) G[i] /= trace;
-        for (int64_t i = 0; i < F * F; i++) square[i] = 0;
-        for (int64_t i = 0; i < F; i++) for (int64_t k = 0; k < F; k++) for (int64_t j = 0; j < F; j++) {
-            square[i * F + j] += G[i * F + k] * G[k * F + j];
-        }
+        for (int64_t i = 0; i < F; i++) trace += G[i * S + i];
+        const double change = part * log(trace); /* after the first, each is less than the square of the one before */
+        result += change;
+        if (squaring >= squarings || result < least || (squaring && -change < exp2(-squarings) * part)) return result;
+        for (int64_t i = 0; i < F * S; i++) G[i] /= trace;
+        for (int64_t i = 0; i < F * S; i++) square[i] = 0;
+        for (int64_t i = 0; i < F; i++) for (int64_t k = 0; k < F; k++) add(S, G[i * S + k], G + k * S, square + i * S);
         double *before = G;
         G = square, square = before;
     }
 }
 
-/* The sum of the squares of N(t) Phi(t, s) N(s)' over all pairs of instants t >= s; before is (F, F, n_x), after and
-   earlier are (F, n_x), W is (n_x, n_x). */
+/* The sum of the squares of N(t) Phi(t, s) N(s)' over all pairs of instants t >= s, W (n_x, n_x). With S = PADDED(n_x),
+   before has F F S numbers, after and earlier have F S, and W has n_x S. */
 static void sum_of_squares(int64_t n, int64_t n_x, int64_t F, const double *Q, const double *P, const double *inverses,
                            double *before, double *after, double *earlier, double *W)
 {
-    for (int64_t i = 0; i < n_x * n_x; i++) W[i] = 0;
-    for (int64_t i = 0; i < n_x * F * F; i++) before[i] = 0;
+    const int64_t S = PADDED(n_x);
+    for (int64_t i = 0; i < n_x * S; i++) W[i] = 0;
+    for (int64_t i = 0; i < F * F * S; i++) before[i] = 0;
+    for (int64_t i = 0; i < F * S; i++) after[i] = earlier[i] = 0;
     for (int64_t t = 0; t < n; t++, Q += F * n_x) {
-        for (int64_t i = 0; i < F * n_x; i++) after[i] = earlier[i] = 0;
-        for (int64_t j = 0; j < F; j++) for (int64_t k = 0; k <= j; k++) for (int64_t i = 0; i < n_x; i++) {
-            after[j * n_x + i] += Q[k * n_x + i] * AT(P, t, k, j);
-            earlier[k * n_x + i] += Q[j * n_x + i] * AT(inverses, t, k, j);
+        for (int64_t j = 0; j < F; j++) for (int64_t i = 0; i < n_x; i++) {
+            double sum = 0, other = 0;
+            for (int64_t k = 0; k <= j; k++) sum += Q[k * n_x + i] * AT(P, t, k, j);
+            for (int64_t k = j; k < F; k++) other += Q[k * n_x + i] * AT(inverses, t, j, k);
+            after[j * S + i] = sum;
+            earlier[j * S + i] = other;
         }
         for (int64_t a = 0; a < F; a++) for (int64_t b = a; b < F; b++) {
-            double *sums = before + (a * F + b) * n_x;
-            for (int64_t j = 0; j < n_x; j++) sums[j] += earlier[a * n_x + j] * earlier[b * n_x + j];
+            double *sums = before + (a * F + b) * S, *first = earlier + a * S, *second = earlier + b * S;
+            for (int64_t j = 0; j < S; j++) sums[j] += first[j] * second[j];
             for (int64_t i = 0; i < n_x; i++) {
-                const double both = (a == b ? 1 : 2) * after[a * n_x + i] * after[b * n_x + i];
-                for (int64_t j = 0; j < n_x; j++) W[i * n_x + j] += both * sums[j];
+                add(S, (a == b ? 1 : 2) * after[a * S + i] * after[b * S + i], sums, W + i * S);
             }
         }
     }
+    for (int64_t i = 0; i < n_x; i++) for (int64_t j = 0; j < n_x; j++) W[i * n_x + j] = W[i * S + j];
 }
 
 /* Propagators P from the first instant to each of the n cuts, and the deviations there, from the log of `deviations`. */
@@ -166,14 +180,16 @@ static void bounds(int64_t n, int64_t F, const double *A, const double *B, doubl
 
 /* ln of the growth between the n cuts of `deviations`, (n, n), from its log, and the scale of the states: as `_growth` of
    growth.py. Q are the deviations at the first cut. A pair of which the growth is less than between two that are no
-   farther apart has a lower bound. Returns 0 beyond moderate propagators, of which products with inverses lose digits.
-   work has 3 n F^2 + 3 F^2 + n_x F (F + n) + n F + 2 n (n + 1) + n_x (2 F + 2 + n_x) numbers. */
+   farther apart is left out. Returns 0 beyond moderate propagators, of which products with inverses lose digits.
+   With S = PADDED(n_x),
+   work has 3 n F^2 + 4 F PADDED(F) + n n_x F + n F + 2 n (n + 1) + S (F^2 + 2 F + 2 + n_x) numbers. */
 int64_t FN(growth)(int64_t steps, int64_t n_x, const double *log_of_steps, int64_t n, const double *cuts,
                    const double *Q, int64_t F, const Settings *settings, double *work, double *scale, double *logs)
 {
-    double *P = work, *inverses = P + n * F * F, *pair = inverses + n * F * F, *before = pair + 3 * F * F;
-    double *corners = before + n_x * F * F, *least = corners + n * F * n_x, *most = least + n * n, best = 0;
-    double *after = most + n * n + n * F * F + n * F + 2 * n, *earlier = after + n_x * (F + 2), *W = earlier + n_x * F;
+    const int64_t S = PADDED(n_x);
+    double *P = work, *inverses = P + n * F * F, *pair = inverses + n * F * F, *before = pair + 4 * F * PADDED(F);
+    double *corners = before + S * F * F, *least = corners + n * F * n_x, *most = least + n * n, best = 0;
+    double *after = most + n * n + n * F * F + n * F + 2 * n, *earlier = after + S * (F + 2), *W = earlier + S * F;
     const double least_part = exp2(-settings->squarings) * log((double)F);
     from_the_start(steps, n_x, log_of_steps, n, cuts, Q, F, P, corners, pair);
     for (int64_t k = 0; k < n; k++) inverse(F, P + k * F * F, inverses + k * F * F);
@@ -192,9 +208,10 @@ int64_t FN(growth)(int64_t steps, int64_t n_x, const double *log_of_steps, int64
     for (int64_t apart = 0; apart < n; apart++) {
         for (int64_t t = apart; t < n; t++) best = fmax(best, least[t * n + t - apart]);
         for (int64_t s = 0, t = apart; t < n; s++, t++) {
-            double *result = logs + s * n + t, log_best = log(fmax(best, settings->tiny)) / 2;
-            *result = log(fmax(least[t * n + s], settings->tiny)) / 2;
+            double *result = logs + s * n + t;
+            if (least[t * n + s] >= best) *result = log(fmax(best, settings->tiny)) / 2;
             if (!(most[t * n + s] > best) || !(most[t * n + s] > settings->tiny)) continue;
+            const double log_best = log(fmax(best, settings->tiny)) / 2;
             product(F, P + t * F * F, inverses + s * F * F, pair);
             *result = log_norm(F, pair, settings->squarings, log_best, pair + F * F);
             best = fmax(best, exp(2 * *result - least_part));

@@ -23,6 +23,9 @@ static const int8_t free_rates[] = FREE;
 #define IS_FREE(i) 1
 #endif
 
+/* The larger of two numbers >= 0; NaN if one is none. */
+static inline void widen(double *largest, double a) { *largest = a > *largest || isnan(a) ? a : *largest; }
+
 /* The highest level at which the i-th quasi-coordinate is integrated. */
 static inline int64_t highest_level(int64_t i)
 {

@@ -134,6 +134,26 @@ int64_t FN(taylor)(const Steps *s)
     }
 }
 
+#ifdef SETTLED
+/* Put what rows determine in place of the first `settled` jets at n instants t in the steps k of a log, and enlarge `farthest` (N) to its largest
+   distance from gamma^(s) if that is among the jets. */
+static void by_rows(const double *log, int64_t n, const int64_t *k, const double *t, const double *p, int64_t settled,
+                    double *jets, double *farthest)
+{
+    for (int64_t at = 0; at < n; at++) {
+        const double *row = log + k[at] * (1 + NX + NY);
+        double x[NX + 1], branch[NP], all[NX + N];
+        for (int64_t i = 0; i < NX; i++) x[i] = jets[i * n + at];
+        on_branch(p, (row[0] + row[1 + NX + NY]) / 2, branch);
+        FN(settled)(t[at], x, branch, all);
+        for (int64_t i = 0; i < N && farthest; i++) widen(farthest + i, fabs(jets[(NX + i) * n + at] - all[NX + i]));
+        for (int64_t i = NQ; i < settled; i++) jets[i * n + at] = all[i];
+    }
+}
+#else
+#define by_rows(log, n, k, t, p, settled, jets, farthest) ((void)(p), (void)(settled), (void)(farthest))
+#endif
+
 /* The jets q, gamma', ..., gamma^(levels) at n instants t in the steps k of a log, row by row, one column per instant.
    The lanes of a vector are consecutive instants of one step. Of the first `settled` jets those that rows determine are
    theirs. */
@@ -159,18 +179,8 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
             }
         }
     }
-#ifdef SETTLED
-    for (int64_t at = 0; at < n && settled; at++) {
-        const double *row = log + k[at] * (1 + NX + NY);
-        double x[NX + 1], branch[NP], all[NX + N];
-        for (int64_t i = 0; i < NX; i++) x[i] = jets[i * n + at];
-        on_branch(p, (row[0] + row[1 + NX + NY]) / 2, branch);
-        FN(settled)(t[at], x, branch, all);
-        for (int64_t i = NQ; i < settled; i++) jets[i * n + at] = all[i];
-    }
-#else
-    (void)p, (void)settled;
-#endif
+    if (settled) by_rows(log, n, k, t, p, settled, jets, 0);
 }
 
 #include "deviations.h"
+#include "whole.h"
