@@ -268,7 +268,9 @@ def test_the_rate_of_a_constant_heading_of_a_moving_car_holds_its_steering_strai
     """With v tan(δ)/a = 0 and v = c, δ = 0 and x is straight; every multiple of zero is zero, whatever it is beside."""
     mechanism = steered(1.1 * scale)
     q, (v, _) = mechanism.q, mechanism.q.w()
-    model = derive(mechanism, sv.Program({"heading": q.dt(factor * (q["psi"] - 0.3)), "speed": v - scale}, by=by))
+    program = sv.Program({"heading": q.dt(factor * (q["psi"] - 0.3)), "speed": v - scale}, by=by)
+    with warned("'heading'", "product", "tan(delta) or v"):
+        model = derive(mechanism, program)
     run = simulate(model, model.start(x=0.0, y=0.0, psi=0.3), (0.0, 3.0))
     assert model.free == 1 and run.message == "finished" and verify(model, run).passed
     assert run["x"][-1] == pytest.approx(3.0 * scale * np.cos(0.3), rel=1e-12)
