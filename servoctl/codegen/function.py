@@ -219,7 +219,7 @@ class Compiled:
         self._calls += 1
         if self._calls == CALLS and compiler.compiler() and not emit.contains(self.expression, ca.OP_ERFINV):
             library = compiler.library(emit.emit_builtin(self.expression, self._symbol), exact=True)
-            self._builtin = library and builtin(library, self._symbol, self.n_y)
+            self._builtin = library and builtin(library, self._symbol)
         row_y, run = self._place(self._interpreter, t, x, p)
         run()
         return row_y.copy()
