@@ -8,9 +8,12 @@ import numpy as np
 
 from servoctl.codegen.interpreted import Workspace, connected
 
-_OF_PYTHON = "PyFloat_AsDouble PyErr_Occurred PyErr_Clear Py_IncRef PyCFunction_NewEx".split()  # in the order of builtin.c
+_OF_PYTHON = (  # in the order of builtin.c
+    "PyFloat_AsDouble PyErr_Occurred PyErr_Clear PyObject_Vectorcall PyCFunction_NewEx".split()
+)
 _VERSION, _NEW = 0, 93  # in NumPy's table of functions: PyArray_GetNDArrayCVersion, PyArray_New
 _ABI = 0x2000000  # of NumPy 2: PyArray_New and the fields of an array as builtin.c has them
+_HEADER = 2 * ctypes.sizeof(ctypes.c_void_p)  # of an object: references and type; Python without its lock has more
 
 
 class Library:
@@ -112,8 +115,11 @@ class Library:
         return n, count.value
 
 
-def builtin(library, symbol):
-    """A function (t, x, p) -> new array of a library by builtin.c; None where Python or NumPy has no such interface."""
+def builtin(library, symbol, otherwise):
+    """A function (t, x, p) -> new array of a library by builtin.c; None where Python or NumPy has no such interface.
+
+    What is no number and two arrays as C has them goes to the function ``otherwise``.
+    """
     try:
         functions = [ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value for name in _OF_PYTHON]
         capsule = np._core._multiarray_umath._ARRAY_API
@@ -121,12 +127,11 @@ def builtin(library, symbol):
         return None
     pointer_in = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)
     table = (ctypes.c_void_p * (_NEW + 1)).from_address(pointer_in(("PyCapsule_GetPointer", ctypes.pythonapi))(capsule, None))
-    header = 2 * ctypes.sizeof(ctypes.c_void_p)  # a count of references and a type; Python without its lock has more
-    if object.__basicsize__ != header or ctypes.CFUNCTYPE(ctypes.c_uint)(table[_VERSION])() != _ABI:
+    if object.__basicsize__ != _HEADER or ctypes.CFUNCTYPE(ctypes.c_uint)(table[_VERSION])() != _ABI:
         return None
     make = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.py_object)((f"{symbol}_builtin", library))
     addresses = *functions, table[_NEW], id(np.ndarray)
-    return make((ctypes.c_void_p * len(addresses))(*addresses), None)
+    return make((ctypes.c_void_p * len(addresses))(*addresses), otherwise)
 
 
 def argument(array):
