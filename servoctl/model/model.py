@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import MOST_JETS, as_numbers, finite, named, whole
-from servoctl.codegen.function import compiled
+from servoctl.codegen.function import Compiled, compiled
 from servoctl.errors import ServoError, SingularProgram, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
@@ -685,7 +685,7 @@ class Model(Shown):
     def operations(self):
         """Number of operations of each function built so far, by name."""
         signals = {value[1].name: value[1] for value in self._functions.values() if isinstance(value, tuple)}
-        return {name: f.operations for name, f in (self._functions | signals).items() if hasattr(f, "operations")}
+        return {name: f.operations for name, f in (self._functions | signals).items() if isinstance(f, Compiled)}
 
     def start(
         self, /, t: float = 0.0, guess: Mapping[str, float] | None = None,

@@ -87,6 +87,7 @@ DECLARED(example_settled, double)
 DECLARED(example_jacobian, double)
 DECLARED(example_wide, W)
 DECLARED(expansion, W)
+DECLARED(off_manifold, W)
 DECLARED(numbers, W)
 DECLARED(change, W)
 #define PHASE(name, number) \
