@@ -333,7 +333,7 @@ def test_arrays_of_every_kind_reach_compiled_points(monkeypatch, c_compiler):
     np.testing.assert_array_equal(result, y)
     assert result.flags.owndata and result.flags.carray and result.dtype is y.dtype and result.dtype == float
     assert np.isfinite(model(-1.0, x, p)).all()  # as the C function gives an error of Python
-    for arguments in ((2.0, x.astype(np.float32)[:1], p), (2.0, grid, p), (2.0, x.view(complex), p), (2.0, x, p[:0])):
+    for arguments in ((2.0, x.astype(np.float32)[:1], p), (2.0, grid, p), (2.0, x, p[:0])):
         with refused(SpecificationError):
             model(*arguments)
     for arguments in ((2.0, x), (2.0, x, p, p), ("two", x, p), (None, x, p)):

@@ -598,7 +598,7 @@ class Compiled:
 
 
 class _Often(Compiled):
-    """One that has been called often: a call of it is that of its builtin, which calls `Compiled.__call__` if need be."""
+    """One that has been called often: a call is that of its builtin, which calls `Compiled.__call__` if need be."""
 
     __slots__ = ()
     _equals = Compiled  # in comparisons of values

@@ -126,7 +126,8 @@ def builtin(library, symbol, otherwise):
     except AttributeError:
         return None
     pointer_in = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)
-    table = (ctypes.c_void_p * (_NEW + 1)).from_address(pointer_in(("PyCapsule_GetPointer", ctypes.pythonapi))(capsule, None))
+    address = pointer_in(("PyCapsule_GetPointer", ctypes.pythonapi))(capsule, None)
+    table = (ctypes.c_void_p * (_NEW + 1)).from_address(address)
     if object.__basicsize__ != _HEADER or ctypes.CFUNCTYPE(ctypes.c_uint)(table[_VERSION])() != _ABI:
         return None
     make = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.py_object)((f"{symbol}_builtin", library))
