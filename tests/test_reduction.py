@@ -249,6 +249,32 @@ def test_a_residual_with_a_speed_for_a_factor_is_told_so(expanded):
     assert derive(mechanism, sv.Program({"slip": slip, "speed": speed}, by="ideal")).free == 1
 
 
+def steered(base=1.1):
+    """A car of unit inertias that is driven and steered, in velocities v along its axis and s of its steering."""
+    p = sv.coordinates("x y psi delta")
+    psi, delta = list(p)[2:]
+    turn = ca.tan(delta) / base
+    q = p.with_quasi_velocities("v s", [[ca.cos(psi), 0], [ca.sin(psi), 0], [turn, 0], [0, 1]])
+    v, s = q.w()
+    gibbs = sv.particle(q, 1.0, tuple(q)[:2]) + (q.dt(turn * v) ** 2 + q.dt(s) ** 2) / 2
+    return sv.Mechanism(q, gibbs=gibbs, actuators={"F": (1, 0), "T": (0, 1)})
+
+
+@pytest.mark.parametrize(
+    ("scale", "factor", "by"),
+    [(1.0, 1.0, "actuators"), (1.0, 1.0, "ideal"), (1e-3, -3.0, "actuators"), (1e6, -3.0, "ideal")],
+)
+def test_the_rate_of_a_constant_heading_of_a_moving_car_holds_its_steering_straight(scale, factor, by):
+    """With v tan(δ)/a = 0 and v = c, δ = 0 and x is straight; every multiple of zero is zero, whatever it is beside."""
+    mechanism = steered(1.1 * scale)
+    q, (v, _) = mechanism.q, mechanism.q.w()
+    model = derive(mechanism, sv.Program({"heading": q.dt(factor * (q["psi"] - 0.3)), "speed": v - scale}, by=by))
+    run = simulate(model, model.start(x=0.0, y=0.0, psi=0.3), (0.0, 3.0))
+    assert model.free == 1 and run.message == "finished" and verify(model, run).passed
+    assert run["x"][-1] == pytest.approx(3.0 * scale * np.cos(0.3), rel=1e-12)
+    assert run["psi"] == pytest.approx(0.3, abs=1e-12) and run["delta"] == pytest.approx(0.0, abs=1e-12)
+
+
 PRODUCTS = {  # residuals a and b of x, y, z and t; the factor of b that a keeps at zero
     "two residuals": (lambda x, y, z, t: (x - t, (x - t) * (y - ca.sin(t))), "(x-t)"),
     "in a fraction": (lambda x, y, z, t: (x - t, -2 * (x - t) * (y - t) / (2 + ca.cos(z))), "(x-t)"),

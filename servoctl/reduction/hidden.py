@@ -11,7 +11,7 @@ import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.jets.branches import cse, shown
-from servoctl.reduction.manifold import POINTS_SEED, SPREAD, sample
+from servoctl.reduction.manifold import POINTS_SEED, SPREAD, anywhere, sample
 from servoctl.reduction.ranks import clean, decide, decide_each, eliminate, generic
 from servoctl.reduction.rows import (
     Row,
@@ -116,6 +116,9 @@ def _lowest(q, rows, numbers, context, starts=None, most=None):
     # constraints stay as they are written.
     order = sorted(range(len(rows)), key=lambda a: (rows[a].kind == "dynamics", rows[a].order, a))
     support, weights = dependence(numbers[order])
+    if not support:  # a gradient that is rounding at some points and zero at others depends on rows after it, too
+        order = order[::-1]
+        support, weights = dependence(numbers[order])
     if not support:  # the ranks at single points and the dependence at all of them disagree
         raise _ill_conditioned(rows, generic(decide_each(numbers))[0])
     support = [order[i] for i in support]
@@ -158,8 +161,8 @@ def _slopes_beside(q, rows, combination, context):
     Where the slopes vanish beside the manifold of the other rows, too, they vanish identically.
     """
     level, points = combination.whole.order, combination.points
-    spread = 1.0 + SPREAD * np.random.default_rng(POINTS_SEED).uniform(-1.0, 1.0, points.z.shape)
-    values = slopes(q, combination.whole, level, replace(points, z=points.z * spread))
+    # at random points, not in proportion to these: what the rows keep at zero is not zero there
+    values = slopes(q, combination.whole, level, anywhere(q, points.level, context))
     if not np.any(values):
         return values
     rest = [row for a, row in enumerate(rows) if a != combination.replaces]
