@@ -39,12 +39,12 @@ def new_process(monkeypatch):
     monkeypatch.setattr(compiler, "_warned", False)
 
 
-def test_points_and_short_grids_are_not_compiled_however_many(fresh):
-    model = pendulum()
-    for _ in range(200):
-        model(0.0, [0.1, 0.2], [1.0])
-        model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
-    assert not fresh and model.backend == "casadi"
+def test_points_and_short_grids_compile_no_function_however_many(fresh):
+    for model in (pendulum(), compiled(function(X2[1], -P1 * X2[0]), "spring")):
+        for _ in range(200):
+            model(0.0, [0.1, 0.2], [1.0])
+            model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
+        assert len(fresh) == 1 and model.backend == "casadi"  # the unit that takes the operations of any function
 
 
 def test_points_called_ten_thousand_times_are_compiled(fresh):

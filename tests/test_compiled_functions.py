@@ -2,23 +2,28 @@
 
 import copy
 import ctypes
+import gc
 import itertools
 import pickle
 import re
+import sys
 import threading
+import tracemalloc
+import weakref
 
 import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
 
-from servoctl.codegen import compiler, emit
+from servoctl.codegen import compiler, emit, native
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
 from servoctl.codegen.interpreted import MANY_POINTS, Interpreter
 from servoctl.codegen.machine import ENOUGH, TOGETHER, Machine
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.methods.runge_kutta import tableau
+from servoctl.values import same
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RK4 = tableau("RK4")
@@ -302,6 +307,75 @@ def test_compiled_points_take_what_others_take(monkeypatch, c_compiler):
             model(0.0, x, p)
     copied = pickle.loads(pickle.dumps(model))
     np.testing.assert_array_equal(copied(*forms[0]), before[0])
+    assert model == copied == model and same([model], [copied]) and same(copied, model)
+
+
+def test_arrays_of_every_kind_reach_compiled_points(monkeypatch, c_compiler):
+    class Own(np.ndarray):
+        pass
+
+    class Emptying:  # shrinks the array beside it when it is read as a number
+        def __float__(self):
+            x.resize(0, refcheck=False)
+            return 2.0
+
+    model, x, p = often(monkeypatch, pendulum()), np.array([0.3, 1.2]), np.array([1.5])
+    y, grid = model(2.0, x, p), np.array([[0.3, 1.2], [7.0, 8.0]])
+    swapped, read_only = x.astype(">f8"), x.copy()
+    read_only.flags.writeable = False
+    forms = (x.view(Own), read_only, pickle.loads(pickle.dumps(x)), swapped, x.astype(np.dtype("f8").newbyteorder("=")),
+            x[::-1].copy()[::-1], np.asfortranarray(grid)[0], grid[0], np.broadcast_to(x, (1, 2))[0], x.astype(np.longdouble),
+            x.astype(np.dtype("f8", metadata={"unit": "m"})), x.astype(object), memoryview(x), x.view("V8").view(float))
+    for form in forms:
+        assert type(result := model(2.0, form, p)) is np.ndarray
+        np.testing.assert_array_equal(result, y)
+    result = model(p=p, t=2.0, x=x)
+    np.testing.assert_array_equal(result, y)
+    assert result.flags.owndata and result.flags.carray and result.dtype is y.dtype and result.dtype == float
+    assert np.isfinite(model(-1.0, x, p)).all()  # as the C function gives an error of Python
+    for arguments in ((2.0, x.astype(np.float32)[:1], p), (2.0, grid, p), (2.0, x, p[:0])):
+        with refused(SpecificationError):
+            model(*arguments)
+    for arguments in ((2.0, x), (2.0, x, p, p), ("two", x, p), (None, x, p)):
+        with pytest.raises((TypeError, ValueError)):
+            model(*arguments)
+    with refused(SpecificationError):
+        model(Emptying(), x, p)
+
+
+def test_compiled_points_leave_no_reference_behind(monkeypatch, c_compiler):
+    model, t, x, p = often(monkeypatch, pendulum()), 1.25, np.array([0.3, 1.2]), np.array([1.5])
+    kept = (t, x, p, x.dtype, np.ndarray, model, model._builtin)
+    before = [sys.getrefcount(one) for one in kept]
+    y = model(t, x, p)
+    assert sys.getrefcount(y) == 2
+    del y
+    tracemalloc.start()
+    for _ in range(1000):
+        model(t, x, p)
+        model(t, [0.3, 1.2], p)
+    start = tracemalloc.get_traced_memory()[0]
+    for _ in range(20_000):
+        model(t, x, p)
+    grown = tracemalloc.get_traced_memory()[0] - start
+    tracemalloc.stop()
+    assert [sys.getrefcount(one) for one in kept] == before
+    assert grown < 20_000
+    gone = weakref.ref(model)
+    del model, kept
+    gc.collect()
+    assert gone() is None
+
+
+@pytest.mark.parametrize("missing", ["table", "version", "header"])
+def test_points_stay_with_casadi_where_numpy_is_another(monkeypatch, c_compiler, missing):
+    if missing == "table":
+        monkeypatch.delattr(np._core._multiarray_umath, "_ARRAY_API")
+    monkeypatch.setattr(native, "_ABI", native._ABI + (missing == "version"))
+    monkeypatch.setattr(native, "_HEADER", native._HEADER + 8 * (missing == "header"))
+    model = often(monkeypatch, pendulum())
+    assert not model._builtin
+    np.testing.assert_array_equal(model(2.0, [0.3, 1.2], [1.5]), pendulum()(2.0, [0.3, 1.2], [1.5]))
 
 
 def test_points_stay_with_casadi_without_a_compiler_or_a_function_of_c(monkeypatch, c_compiler):

@@ -9,9 +9,11 @@ import numpy as np
 from servoctl.codegen.interpreted import Workspace, connected
 
 _OF_PYTHON = (  # in the order of builtin.c
-    "PyObject_GetBuffer PyBuffer_Release PyFloat_AsDouble PyErr_Occurred PyErr_Clear PyTuple_GetItem "
-    "PyObject_Vectorcall Py_IncRef PyCFunction_NewEx"
-).split()
+    "PyFloat_AsDouble PyErr_Occurred PyErr_Clear PyObject_Vectorcall PyCFunction_NewEx".split()
+)
+_VERSION, _NEW = 0, 93  # in NumPy's table of functions: PyArray_GetNDArrayCVersion, PyArray_New
+_ABI = 0x2000000  # of NumPy 2: PyArray_New and the fields of an array as builtin.c has them
+_HEADER = 2 * ctypes.sizeof(ctypes.c_void_p)  # of an object: references and type; Python without its lock has more
 
 
 class Library:
@@ -113,14 +115,24 @@ class Library:
         return n, count.value
 
 
-def builtin(library, symbol, n_y):
-    """A function (t, x, p) -> new array of a library by builtin.c; None where Python has no such interface."""
+def builtin(library, symbol, otherwise):
+    """A function (t, x, p) -> new array of a library by builtin.c; None where Python or NumPy has no such interface.
+
+    What is no number and two arrays as C has them goes to the function ``otherwise``.
+    """
     try:
-        functions = [ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p) for name in _OF_PYTHON]
+        functions = [ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value for name in _OF_PYTHON]
+        capsule = np._core._multiarray_umath._ARRAY_API
     except AttributeError:
         return None
+    pointer_in = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)
+    address = pointer_in(("PyCapsule_GetPointer", ctypes.pythonapi))(capsule, None)
+    table = (ctypes.c_void_p * (_NEW + 1)).from_address(address)
+    if object.__basicsize__ != _HEADER or ctypes.CFUNCTYPE(ctypes.c_uint)(table[_VERSION])() != _ABI:
+        return None
     make = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.py_object)((f"{symbol}_builtin", library))
-    return make((ctypes.c_void_p * len(functions))(*functions), (np.empty, n_y, None))
+    addresses = *functions, table[_NEW], id(np.ndarray)
+    return make((ctypes.c_void_p * len(addresses))(*addresses), otherwise)
 
 
 def argument(array):

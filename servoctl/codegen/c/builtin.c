@@ -1,82 +1,70 @@
 /* NAME as a builtin function of Python, (t, x, p) -> a new array y: a call through ctypes takes as long as 300 products.
 
-   The functions of Python come as addresses, so that the unit needs neither Python's headers nor its library; all but
-   `empty` are of the stable interface of Python 3.11 and later. */
+   The functions of Python and NumPy come as addresses, so that the unit needs neither their headers nor their libraries;
+   all are of their stable interfaces, as are the fields of an array. */
 #include <stddef.h>
 #include "unit.h"
 
 typedef struct {
+    ptrdiff_t references;
+    void *type, *type_of_numbers;
+    char kind, letter, order, unused;
+    int number;
+} Numbers; /* the first fields of PyArray_Descr */
+
+typedef struct {
+    ptrdiff_t references;
+    void *type;
     double *data;
-    void *object;
-    ptrdiff_t bytes, item;
-    int readonly, axes;
-    char *format;
-    ptrdiff_t *shape, *strides, *suboffsets;
-    void *internal;
-} Buffer; /* Py_buffer */
+    int axes;
+    ptrdiff_t *shape, *strides;
+    void *base;
+    Numbers *numbers;
+    int flags;
+} Array; /* the first fields of PyArrayObject */
 
 static struct {
-    int (*buffer)(void *object, Buffer *, int flags);
-    void (*release)(Buffer *);
     double (*number)(void *object);
     void *(*failed)(void);
     void (*forgive)(void);
-    void *(*item)(void *tuple, ptrdiff_t);
     void *(*call)(void *callable, void *const *arguments, size_t n, void *names);
-    void (*keep)(void *object);
     void *(*function)(void *method, void *self, void *module);
+    void *(*array)(void *type, int axes, const ptrdiff_t *shape, int number, const ptrdiff_t *strides, void *data,
+                   int bytes, int flags, void *object);
+    void *arrays; /* the type numpy.ndarray */
 } python;
 
-enum { SIMPLE = 0, WRITABLE = 1, WITH_FORMAT = 4, CONTIGUOUS = 0x38, FASTCALL = 0x80 };
+enum { DOUBLE = 12, READABLE = 0x101, FASTCALL_KEYWORDS = 0x82 }; /* READABLE: contiguous and aligned */
 
-/* Whether an object is an array of n doubles, one after the other; its buffer has to be released then. */
-static int is_array(void *object, ptrdiff_t n, Buffer *array)
+/* Whether an object is a plain array of n doubles, one after the other, that the processor can read. */
+static int is_array(const Array *array, ptrdiff_t n)
 {
-    if (python.buffer(object, array, WITH_FORMAT | CONTIGUOUS)) {
-        python.forgive();
-        return 0;
-    }
-    if (array->axes == 1 && array->shape[0] == n && array->format[0] == 'd' && !array->format[1]) return 1;
-    python.release(array);
-    return 0;
+    return array->type == python.arrays && array->axes == 1 && array->shape[0] == n
+        && array->numbers->number == DOUBLE && array->numbers->order == '=' && (array->flags & READABLE) == READABLE;
 }
 
-/* The new array; 0 with Python's error where there is no memory. `self` is the tuple (empty, NY, None). */
-static void *evaluated(void *self, double t, const double *x, const double *p)
+/* What `otherwise` returns where t is no number, or x or p no array of its size; 0 with Python's error. */
+static void *called(void *otherwise, void *const *arguments, ptrdiff_t n, void *names)
 {
-    void *size = python.item(self, 1), *result = python.call(python.item(self, 0), &size, 1, 0);
-    Buffer y;
-    if (result && !python.buffer(result, &y, WRITABLE)) {
-        NAME(t, x, p, y.data);
-        python.release(&y);
-    }
-    return result;
-}
-
-/* None where t is no number, or x or p no array of its size. */
-static void *called(void *self, void *const *arguments, ptrdiff_t n)
-{
-    void *result = python.item(self, 2);
-    Buffer x, p;
-    if (n != 3 || !is_array(arguments[1], NX, &x)) return python.keep(result), result;
-    double t = python.number(arguments[0]);
+    static const ptrdiff_t shape[1] = {NY};
+    if (n != 3 || names) return python.call(otherwise, arguments, n, names);
+    double t = python.number(arguments[0]); /* may run code in Python that changes arrays: before they are read */
     if (t == -1.0 && python.failed()) python.forgive();
-    else if (is_array(arguments[2], NP, &p)) {
-        result = evaluated(self, t, x.data, p.data);
-        python.release(&p);
-        python.release(&x);
-        return result;
+    else if (is_array(arguments[1], NX) && is_array(arguments[2], NP)) {
+        const Array *x = arguments[1], *p = arguments[2], *y = python.array(python.arrays, 1, shape, DOUBLE, 0, 0, 0, 0, 0);
+        if (y) NAME(t, x->data, p->data, y->data);
+        return (void *)y;
     }
-    python.release(&x);
-    return python.keep(result), result;
+    return python.call(otherwise, arguments, n, 0);
 }
 
 /* A new builtin function; `functions` are the addresses of `python` above. */
-void *FN(builtin)(void *const *functions, void *self)
+void *FN(builtin)(void *const *functions, void *otherwise)
 {
-    static struct { const char *name; void *(*call)(void *, void *const *, ptrdiff_t); int flags; const char *text; }
-        method = {"evaluate", called, FASTCALL, 0};
+    static struct { const char *name; void *(*call)(void *, void *const *, ptrdiff_t, void *);
+                    int flags; const char *text; }
+        method = {"evaluate", called, FASTCALL_KEYWORDS, 0};
     void **place = (void **)&python;
     for (size_t i = 0; i < sizeof python / sizeof *place; i++) place[i] = functions[i];
-    return python.function(&method, self, 0);
+    return python.function(&method, otherwise, 0);
 }
