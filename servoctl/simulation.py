@@ -511,7 +511,15 @@ def _require_decay(model, drift, t0, t1):
 
 def as_state(model, start, t0):
     """The state X (n_x,) that a start gives at t0."""
-    values = as_numbers(start if isinstance(start, dict) else getattr(start, "values", start))
+    if isinstance(start, Mapping):
+        given = ", ".join(f"{name}={value!r}" for name, value in start.items())
+        raise SpecificationError(
+            f"The start is a dict of {', '.join(map(repr, start)) or 'nothing'}.",
+            "A program determines further values at its start, so that it takes a state that satisfies all of it.",
+            do=f"Use model.start({given}), or model.start(guess={{...}}) for values that may change.",
+            names=list(start),
+        )
+    values = as_numbers(getattr(start, "values", start))
     if values.shape != (len(model.state_names),) or not np.all(np.isfinite(values)):
         raise SpecificationError(
             f"The start has the shape {values.shape}.",

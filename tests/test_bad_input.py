@@ -408,3 +408,16 @@ def test_invariants_hold_at_every_level_of_a_start():
         values = model.function("invariants")(t, state.values, model.parameters)[: len(model.invariant_names())]
         assert np.max(np.abs(values)) < 1e-10
         assert state.t == t and state.free == ()
+
+
+def test_a_dict_is_no_start_of_a_program():
+    mechanism, program = overhead_crane()
+    model = derive(mechanism, program)
+    with refused(SpecificationError, "'l'", "model.start(l=4.0)", names=["l"]):
+        simulate(model, {"l": 4.0}, (0.0, 1.0))
+
+
+def test_what_a_held_value_should_be_is_zero_where_it_is_rounding():
+    mechanism, program = overhead_crane()
+    with refused(InconsistentStart, "x = 1", "Nearest: x = 0.", held="x", nearest_value=0.0):
+        derive(mechanism, program).start(x=1.0, l=4.0)

@@ -662,8 +662,9 @@ class TaylorSteps(Stepping):
             by_rows, jets = "settled" in self.f.others, self.settings.jets or 0
             parts = log.jets(steps_of(t, times), times, max(jets, self.top - (not by_rows)), by_rows)
             x, top = parts[: self.n_x], parts[self.n_x :]
-            if not len(top):  # more accurate than as a derivative of the series
-                top = self.rates.grid(times, x, self.model.parameters)[self.n_x - self.n : self.n_x]
+            if not len(top) or self.doubted:  # more accurate than as a derivative of the series
+                rates = self.rates.grid(times, x, self.model.parameters)[self.n_x - self.n : self.n_x]
+                top = np.concatenate([rates, top[self.n :]])
             self.motion.add(self.model, times, x, top)
         return pending[~due]
 

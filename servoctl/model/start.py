@@ -426,6 +426,7 @@ def _refuse(equations, aim, held, x):
         left = dict(zip(equations.rows, equations(loosened)[0], strict=True))
         states = dict(zip(aim.names, loosened, strict=True))
         moved = {name: float(states[name] if name in states else held[name] + left[name]) for name in held}
+        moved = {name: value if abs(value) > TOLERANCE * abs(held[name]) else 0.0 for name, value in moved.items()}
         change = max(moved, key=lambda n: abs(moved[n] - held[n]) / (1.0 + abs(held[n])))
         largest, worst = max(zip(residuals, equations.rows, strict=True))
         by_others = "the constraints together with the other held values"

@@ -59,7 +59,7 @@ class Motions(Traced):
 
     def __repr__(self):
         failed = int(np.sum(self.study["error"] != ""))
-        lines = [f"Motions: {len(self)} cases, {failed} ended early; {self.study.meta['method']}"]
+        lines = [f"Motions: {len(self)} cases, {failed} with an error; {self.study.meta['method']}"]
         lines += [f"  traces at {len(self.t)} instants" if len(self.t) else "  no traces"]
         shown = [name for name in self.study.columns if name not in FAILURE[1:]][:8]
         return "\n".join([*(line[:120] for line in lines), *table(self.study, shown, most=5)])
