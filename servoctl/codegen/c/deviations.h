@@ -61,9 +61,10 @@ COLD int moved(double t, const double *x, const double *p, double h, int64_t fix
 }
 
 /* Deviations along a motion from the state x at the first of the cuts, at which steps end; between them steps are as long
-   as the tolerance allows. The first `fixed` deviations stay. `settings` are rtol, atol, nearby and left_out. x and Q are those of the end on return, and each
-   row of the log has the instant of a step's end, Q (F, NX) and R (F, F) there. Returns the number of steps, at most
-   `most`; -1 where series are too short for the deviations, vanish, or are not finite. */
+   as the tolerance allows. The first `fixed` deviations stay. `settings` are rtol, atol, nearby and left_out. x and Q
+   are those of the end on return, and each row of the log has the instant of a step's end, Q (F, NX) and R (F, F) there.
+   Returns the number of steps, at most `most`; -1 where series are too short for the deviations, vanish, or are not
+   finite. */
 __attribute__((cold)) int64_t FN(deviations)(int64_t count, const double *cuts, double *x, const double *p,
                                              const double *settings, int64_t fixed, int64_t F,
                                              const double *sizes, double *Q, int64_t most, double *log)

@@ -135,8 +135,8 @@ int64_t FN(taylor)(const Steps *s)
 }
 
 #ifdef SETTLED
-/* Put what rows determine in place of the first `settled` jets at n instants t in the steps k of a log, and enlarge `farthest` (N) to its largest
-   distance from gamma^(s) if that is among the jets. */
+/* Put what rows determine in place of the first `settled` jets at n instants t in the steps k of a log, and enlarge
+   `farthest` (N) to its largest distance from gamma^(s) if that is among the jets. */
 static void by_rows(const double *log, int64_t n, const int64_t *k, const double *t, const double *p, int64_t settled,
                     double *jets, double *farthest)
 {

@@ -82,11 +82,15 @@ static void compare(const double *row, double h, double end, int by_samples, con
     }
 }
 
-/* Returns the number of steps to the only one of the ends; -1 where they do not reach it. In this order, `facts` are: how far gamma^(s) of the
-   series is at most from that of the equations (N), the longest step, at the ends of all steps the largest size of each
-   state (NX), after each step that of each invariant (INVARIANTS), the least size of each pivot (N_PIVOTS), 0 where its
-   sign changes, and its largest one (N_PIVOTS), the outputs of `invariants` at the
-   start, and the largest of them at the end, relative to its gradient times the state. */
+/* Returns the number of steps to the only one of the ends; -1 where they do not reach it. `facts` are, in this order:
+     N                      how far gamma^(s) of the series is at most from that of the equations
+     1                      the longest step
+     NX                     the largest size of each state at the ends of all steps
+     INVARIANTS             the largest size of each invariant after each step
+     N_PIVOTS               the least size of each pivot, 0 where its sign changes
+     N_PIVOTS               its largest size
+     OUTPUTS_OF_INVARIANTS  the outputs of `invariants` at the start
+     1                      the largest invariant at the end, relative to its gradient times the state */
 int64_t FN(whole)(const Steps *s, const Whole *w)
 {
     double p[NP];
