@@ -382,10 +382,12 @@ class Run(Sampled, Value):
         best = (float(self.t[k]), float(values[k]))
         low, high = sorted((self.t[0], self.t[-1]))
         # no polynomial crosses a knot, where derivatives jump
-        edges = [self.t[0], *(knot for knot in self.knots if low < knot < high), self.t[-1]]
+        edges = [low, *(knot for knot in sorted(self.knots) if low < knot < high), high]
         for a, b in zip(edges[:-1], edges[1:], strict=True):
-            inside = np.flatnonzero((self.t >= min(a, b)) & (self.t <= max(a, b)))
-            if k not in inside or len(inside) < 4:
+            if not a <= self.t[k] <= b:
+                continue
+            inside = np.flatnonzero((self.t >= a) & (self.t <= b))
+            if len(inside) < 4:
                 continue
             first = min(max(k - STENCIL // 2, inside[0]), max(inside[0], inside[-1] - STENCIL + 1))
             window = slice(first, min(first + STENCIL, inside[-1] + 1))

@@ -10,6 +10,7 @@ from test_continuation import arm, moved
 
 import servoctl as sv
 from servoctl import plots
+from servoctl.run import Run
 
 
 @pytest.fixture(scope="module")
@@ -140,3 +141,11 @@ def test_a_mechanism_without_outputs_has_an_empty_group_of_them():
     model = sv.derive(mechanism, sv.Program({"X": q.jet(0) - q.t}))
     names, f = model.signals("outputs")
     assert names == [] and f(0.0, np.zeros(f.n_x), []).size == 0
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_no_polynomial_of_an_extremum_crosses_a_knot_forwards_or_backwards(direction):
+    t = np.linspace(0.0, 2.0, 41)[::direction]
+    run = Run(t, np.abs(t - 1.52)[None], ("x",), knots=(0.5, 1.52))
+    (at, least), _ = run.extrema("x")
+    assert (at, least) == (pytest.approx(1.5), pytest.approx(0.02, rel=1e-12))

@@ -300,8 +300,10 @@ class _Checks:
         if len(run.t) < 2:
             self.doubts.append("one sample is no motion: simulate with more samples")
             return None, None, [], None
-        near = np.abs(knots[:, None] - run.t).min(axis=1) <= SAME_TIME * (1 + np.abs(knots)) if len(knots) else []
-        knots = np.array([k for k, known in zip(knots, near, strict=True) if not known and self._inside(k)])
+        ordered = np.sort(run.t)
+        after = np.clip(np.searchsorted(ordered, knots), 1, len(ordered) - 1)
+        near = np.minimum(np.abs(ordered[after - 1] - knots), np.abs(ordered[after] - knots))
+        knots = knots[(near > SAME_TIME * (1 + np.abs(knots))) & (knots > ordered[0]) & (knots < ordered[-1])]
         edges = np.union1d(run.t, knots)[:: 1 if run.t[-1] > run.t[0] else -1]
         sampled, self.edges = np.isin(edges, run.t), edges
         flat = self.model.flat and run.method == "algebraic"
@@ -361,9 +363,6 @@ class _Checks:
             return before
         x = self.run.at(t)[: len(self.model.state_names)]
         return self.family.at(self.family.branches(t, x, sides(self.model, before)))
-
-    def _inside(self, t):
-        return min(self.run.t[0], self.run.t[-1]) < t < max(self.run.t[0], self.run.t[-1])
 
     def _own(self, found):
         """Instants inside the intervals, some OWN_INSTANTS of them, by variant."""
