@@ -428,7 +428,7 @@ class Compiled:
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
-        atol, weights = weighted(atol)
+        atol, weights = (atol, None) if isinstance(atol, float) else weighted(atol)
         return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
 
     def whole(self, start, p, tolerances, most, times, net):

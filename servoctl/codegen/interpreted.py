@@ -42,10 +42,12 @@ class Workspace(threading.local):
         self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
         self.start, self._log = row[: 1 + n_x + n_p], np.empty((0, 0))
         self._task = np.zeros(9)  # the Steps of taylor.c: five numbers; addresses of start, log, ends, weights
+        self.task = memoryview(self._task)
         self._end = np.zeros(1)
         self.end, self._addresses = memoryview(self._end), memoryview(self._task.view(np.int64))
         self._addresses[5], self._own = row.ctypes.data, self._end.ctypes.data
-        self.task, self.pointer = memoryview(self._task), ctypes.c_void_p(self._task.ctypes.data)
+        self.task[0], self._addresses[7], self._ends, self.weights = 1.0, self._own, None, None
+        self.pointer = ctypes.c_void_p(self._task.ctypes.data)
 
     def log(self, rows, columns):
         """Memory for a log; the next log overwrites it."""
@@ -57,14 +59,16 @@ class Workspace(threading.local):
     def until(self, ends):
         """Set the end of the steps, or their ends (N,)."""
         if isinstance(ends, float):  # an array's address takes as long as a step
-            self.end[0], self.task[0], self._addresses[7] = ends, 1.0, self._own
+            self.end[0] = ends
+            if self._ends is not None:
+                self.task[0], self._addresses[7], self._ends = 1.0, self._own, None
         else:
             self._ends = np.atleast_1d(np.ascontiguousarray(ends, dtype=float))
             self.task[0], self._addresses[7] = self._ends.size, self._ends.ctypes.data
 
     def weigh(self, weights):
         """Set the weights of the Taylor method, None for 1."""
-        self._weights = weights  # which must live as long as the call
+        self.weights = weights  # which must live as long as the call
         self._addresses[8] = 0 if weights is None else weights.ctypes.data
 
 

@@ -62,7 +62,8 @@ class Library:
         workspace = self.workspace
         log, task = workspace.log(max_steps + 1, self._columns), workspace.task
         workspace.until(ends)
-        workspace.weigh(weights)
+        if weights is not workspace.weights:
+            workspace.weigh(weights)
         task[1], task[2], task[3], task[4] = rtol, atol, every, max_steps
         return log[: self._taylor(workspace.pointer) + 1].copy()
 
@@ -76,8 +77,8 @@ class Library:
         """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
         workspace, (inside, distance), count = self.workspace, net, len(times)
         workspace.log(most + 1, self._columns)
-        task, end = workspace.task, np.array([t1])
-        workspace.until(end)
+        task = workspace.task
+        workspace.until(float(t1))
         workspace.weigh(None)
         (task[1], task[2]), task[3], task[4] = tolerances, 0.0, most
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
