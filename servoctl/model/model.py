@@ -362,7 +362,7 @@ class Model(Shown):
 
     @property
     def free(self):
-        """The number of free initial values, Σ o_a: the dimension of the internal dynamics."""
+        """The number of free initial values: the dimension of the internal dynamics."""
         return self.reduction.free
 
     @property
