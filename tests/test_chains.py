@@ -278,12 +278,13 @@ def test_conditions_are_evaluated_once():
 
 def test_small_differences_keep_their_digits():
     """What is multiplied out has no differences of larger terms than before."""
-    f = function((X[0] - X[1]) * (X[0] + X[1]) * A + (X[0] - X[1]) ** 2 * B, (X[0] - X[1]) * A + (X[1] - X[0]) * B)
+    f = function((X[0] - X[1]) * (X[0] + X[1]) * A + (X[0] - X[1]) ** 2 * B, (X[0] - X[1]) * A + (X[1] - X[0]) * B,
+                 1e6 * (X[1] - 1) + A * X[2] + B * X[3])
     x, p = np.array([1.0, 1.0 + 1e-12, 0, 0]), [1.0, 3.0, 1.0]
     values = [np.array(ca.Function("way", f.sx_in(), [way])(0, x, p)).ravel() for way in emit.other_ways(f)]
     d = x[0] - x[1]
     for value in values:
-        np.testing.assert_allclose(value, [d * (x[0] + x[1]) + 3 * d**2, -2 * d], rtol=1e-14)
+        np.testing.assert_allclose(value, [d * (x[0] + x[1]) + 3 * d**2, -2 * d, -1e6 * d], rtol=1e-14)
 
 
 def test_a_long_function_is_left_as_it_is():

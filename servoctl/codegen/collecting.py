@@ -205,9 +205,9 @@ class _Collected:
         return result if len(result) <= most else None
 
     def of_inputs(self, atom):
-        """Whether two terms of a sum are inputs."""
-        single = (m[0] for m in self.sums[atom] if len(m) == 1)
-        return sum(n == 1 and isinstance(self.meaning[a], str) for a, n in single) > 1
+        """Whether two terms of a sum are inputs, or an input and a constant."""
+        single = (m for m in self.sums[atom] if len(m) < 2)
+        return sum(all(n == 1 and isinstance(self.meaning[a], str) for a, n in m) for m in single) > 1
 
     def of_one_angle(self, terms):
         """Terms with 1 - cos²s for sin²s, or the other way round, where these are fewer."""

@@ -137,7 +137,8 @@ class Dialect:
 
 
 SCALAR = Dialect(forms=_FORMS_OF_ONE)
-EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
+_OF_ZEROS = {"fmin": "({0} <= {1} || {1} != {1} ? {0} : {1})", "fmax": "({0} >= {1} || {1} != {1} ? {0} : {1})"}
+EXACT = Dialect(forms=_FORMS_OF_ONE | _OF_ZEROS, exact=True)  # of 0 and -0 CasADi takes the first, as C need not
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
 SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True, collected=True)
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")

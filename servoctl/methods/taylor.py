@@ -13,6 +13,7 @@ from math import factorial, perm
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen import emit
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.interpreted import weighted
 from servoctl.errors import SingularProgram
@@ -28,6 +29,7 @@ from servoctl.methods.watch import LEAVES, RESOLUTION, End, Tolerance, net, step
 from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
+from servoctl.reduction.rows import Row
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -35,6 +37,7 @@ FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series o
 STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
 LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
+PRODUCTS = {"mul": 1.0, "div": 1.0, "quad": 1.0, "power": 1.0, "sq": 0.5, "sqrt": 0.5}  # of series in an operation
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
@@ -171,19 +174,72 @@ def _watched(pivot, equations):
     return not ca.symvar(pivot) or any(vanish(v) for o in others for v in spread([pivot - o, pivot + o]))
 
 
+def _in_independent(equations, solved):
+    """The rows with what rows of order 0 and 1 determine put into the others, and L; None if no products fall away.
+
+    A balance with x'' cos θ + y'' sin θ of what rolls has twice the products of series as that of the angles alone.
+    """
+    r, q = equations.r, equations.q
+    if solved is None or equations.top != 2 or r.order:
+        return None
+    inside, columns, _ = solved
+    others = [a for a in range(len(r.rows)) if a not in inside]
+    velocities, accelerations = (_dependent(equations, solved, level) for level in (1, 2))
+    given = ca.vertcat(*(ca.vertcat(*(q.gamma(k)[j] for j in columns)) for k in (2, 1)))
+    found = ca.vertcat(ca.substitute(accelerations, given[len(columns) :], velocities), velocities)
+    put = ca.substitute(ca.vertcat(*(r.rows[a].expression for a in others)), given, found)
+    ways = []
+    for way in emit.other_ways(equations.function("rows", equations.jets, [put])):
+        rows = list(r.rows)
+        for a, expression in zip(others, way.elements(), strict=True):
+            rows[a] = Row(expression, rows[a].order, rows[a].name, rows[a].kind)
+        ways.append(rows)
+    products, _ = _products(q, r.rows)
+    cost, rows = min(((_products(q, way), way) for way in ways), key=lambda pair: pair[0], default=((products,), ()))
+    if cost[0] >= products:
+        return None
+    leading = ca.vertcat(*(row.gradient(q) for row in rows))
+    with noting_dropped() as entries:
+        _, pivots = eliminate(leading, ca.SX(len(rows), 0), clean(*r.points.matrix(leading)))
+    return (rows, leading) if not entries and all(_watched(pivot, equations) for pivot in pivots) else None
+
+
+def _dependent(equations, solved, level):
+    """The velocities or accelerations that rows determine, by the others."""
+    (rows, columns, order), r = solved, equations.r
+    given = ca.vertcat(*(equations.q.gamma(level)[j] for j in columns))
+    right = ca.vertcat(*(equations.levels[a][level - r.rows[a].order] for a in rows))
+    matrix = r.leading[rows, columns]
+    numbers = clean(*r.points.matrix(matrix))
+    return eliminate(matrix, -ca.substitute(right, given, ca.SX.zeros(len(columns))), numbers, order=order)[0]
+
+
+def _products(q, rows):
+    """The number of products of series in rows, where one with itself counts half, and that of all operations."""
+    tape = Tape(None, ca.cse(ca.vertcat(*(row.expression for row in rows))).elements())
+    still = {i for i, symbol in enumerate(tape.symbols) if q.where(symbol) is None}
+    nodes, total, moving = constants_outside(tape, still).nodes, 0.0, []
+    for kind, args, data in nodes:
+        moving.append(data not in still if kind == "input" else any(moving[a] for a in args))
+        series = [a for a in args if moving[a]]
+        total += PRODUCTS.get(kind, 0.0) if len(series) == len(args) or kind == "div" and moving[args[1]] else 0.0
+    return total, len(nodes)
+
+
 class _Rows:
     """The rows of a reduction along a motion, whose coefficients they give index by index."""
 
     def __init__(self, equations):
         self.r, self.top, self.motion = equations.r, equations.top, _Motion(equations)
         self.solved, self.groups = solved_for(equations), []
-        for order in sorted({row.order for row in self.r.rows}):
-            members = [a for a, row in enumerate(self.r.rows) if row.order == order]
-            self.groups.append(_Group(self.motion, order, members, [self.r.rows[a].expression for a in members]))
+        self.rows, self.leading = _in_independent(equations, self.solved.get(1)) or (self.r.rows, self.r.leading)
+        for order in sorted({row.order for row in self.rows}):
+            members = [a for a, row in enumerate(self.rows) if row.order == order]
+            self.groups.append(_Group(self.motion, order, members, [self.rows[a].expression for a in members]))
 
     def advance(self, k):
         """γ_[k]: below s̄ from the state and the rows that determine a part of it, from s̄ on from all rows."""
-        every = range(len(self.r.rows))
+        every = range(len(self.rows))
         rows, columns, order = self.solved.get(k, ([], [], ())) if k < self.top else (every, every, ())
         groups, right = [group for group in self.groups if group.order <= k], {}
         if k:
@@ -201,10 +257,8 @@ class _Rows:
                 group.correct(k)
 
     def _solution(self, place, order, right):
-        if not order:
-            return self.r.solve(right)[0]
-        matrix = self.r.leading[place[0], place[1]]
-        return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
+        matrix = self.leading[place[0], place[1]]
+        return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order or self.r.order)[0]
 
     def by_rows(self, outputs):
         """Outputs with the velocities that rows determine in place of those of the state, which need not meet the rows.

@@ -324,7 +324,7 @@ def _by_coefficients(t, times, points, degree, vanishing):
     factors, shapes = _basis(times, degree, vanishing)
     right = ca.vertcat(points, ca.SX(factors.shape[0] - len(times), points.shape[1]))
     lower, upper = (ca.SX(ca.DM(part.sorted_indices())) for part in (factors.L, factors.U))
-    c = ca.solve(upper, ca.solve(lower, right[np.argsort(factors.perm_r).tolist(), :]))
+    c = ca.solve(upper, ca.solve(lower, right[np.argsort(factors.perm_r).tolist(), :]))[factors.perm_c.tolist(), :]
     inside, pieces = _inside(t, times).T, len(times) - 1
     local = [ca.mtimes(inside, c[r : r + pieces, :]) for r in range(degree + 1)]
     return ca.mtimes(ca.vertcat(*local).T, _looked_up(t, times, shapes))

@@ -22,7 +22,7 @@ from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
-from servoctl.simulation import OFF, as_state, simulated
+from servoctl.simulation import OFF, as_state, sample_times, simulated
 from servoctl.study.cases import FAILURE, as_columns
 from servoctl.study.signals import Signals
 from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
@@ -167,15 +167,7 @@ def _case_table(model, starts, parameters):
 
 
 def _trace_times(span, t_eval):
-    times = np.unique(as_numbers([] if t_eval is None else t_eval))
-    if times.size and not (np.isfinite(times).all() and min(span) <= times[0] and times[-1] <= max(span)):
-        raise SpecificationError(
-            f"t_eval={repr(t_eval)[:150]} was given.",
-            f"Samples are finite times within t_span, {min(span):g} to {max(span):g} s.",
-            t_eval=t_eval,
-            t_span=span,
-        )
-    return times if span[1] > span[0] else times[::-1]
+    return np.array([]) if t_eval is None or not np.size(t_eval) else sample_times(*span, t_eval, ()).copy()
 
 
 def _with_end(times, span):
