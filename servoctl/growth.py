@@ -47,7 +47,8 @@ MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below wh
 SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
-_SETTINGS = (MODERATE, SWEEPS, BALANCED, TINY, SQUARINGS, UNSTABLE, EXPONENTIAL, FASTER, MOST_GROWTH, GREAT)  # of C
+_OF_VERDICT = UNSTABLE, EXPONENTIAL, FASTER, MOST_GROWTH, GREAT
+_SETTINGS = MODERATE, SWEEPS, BALANCED, TINY, SQUARINGS, *_OF_VERDICT  # of the growth in C
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
@@ -305,7 +306,7 @@ def quiet_by_series(model, run, last):
     reached = moved.begin() and moved.move() and _small(np.abs(moved.x - x[:, -1]), size)
     if not reached or not moved.defect() <= DEFECT:
         return False
-    quiet, *_ = flow.growth(moved.Z, len(between), _SETTINGS)
+    quiet, _, _ = flow.growth(moved.Z, len(between), _SETTINGS)
     return quiet or _quiet_by_steps(model, last, between, cuts, x[:, 0], size)
 
 

@@ -22,7 +22,7 @@ class Library:
     backend = "c"
 
     def __init__(self, library, symbol, n_x, n_p, n_y):
-        self._library, self._symbol, self._functions = library, symbol, {}
+        self._library, self._symbol = library, symbol
         self._grid = self.native("grid")
         self._grid.restype = None
         self._columns = 1 + n_x + n_y
@@ -34,9 +34,7 @@ class Library:
 
     def native(self, suffix):
         """The C function ``SYMBOL_suffix``."""
-        if suffix not in self._functions:  # looking it up takes as long as a short call
-            self._functions[suffix] = self._library[f"{self._symbol}_{suffix}"]
-        return self._functions[suffix]
+        return getattr(self._library, f"{self._symbol}_{suffix}")
 
     def grid(self, t, x, p, y):
         """See `Compiled.grid`."""
@@ -77,15 +75,15 @@ class Library:
 
     def whole(self, t1, tolerances, most, times, net, sizes):
         """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
-        workspace, (inside, distance), count = self.workspace, net, len(times)
+        workspace, (inside, *net), count = self.workspace, net, len(times)
         workspace.log(most + 1, self._columns)
         task = workspace.task
         workspace.until(float(t1))
         workspace.weigh(None)
         (task[1], task[2]), task[3], task[4] = tolerances, 0.0, most
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
-        samples = np.array([count, len(inside), 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
-        samples.view(float)[2] = distance
+        samples = np.array([count, len(inside), 0, 0, 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
+        samples.view(float)[2:5] = net
         steps = self._whole(workspace.pointer, argument(samples))
         return (steps, jets, facts) if steps >= 0 else None
 
