@@ -377,19 +377,17 @@ class Compiled:
 
         Returns
         -------
-        x : (n_x, K) array
-            Solutions at the first K times; K < N if the iteration fails at t[K].
-        y : (n_y, K) array
-            Outputs at these times.
+        z : (n_y - pivots, K) array
+            Solutions x at the first K times, dx/dt, d²x/dt² and others; K < N if the iteration fails at t[K].
         iterations : int
             Number of evaluations.
         """
         self._require_loop("newton")
         t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
         nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
-        x, y = np.empty((self.n_x, t.size)), np.empty((self.n_y, t.size))
-        n, iterations = self._library.newton(t, nodes, p, x, y)
-        return x[:, :n], y[:, :n], iterations
+        z = np.empty((self.n_y - self.sizes.get("pivots", 0), t.size))
+        n, iterations = self._library.newton(t, nodes, p, z)
+        return z[:, :n], iterations
 
     def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then pivots.
@@ -587,7 +585,8 @@ class Compiled:
         return row_y, run
 
     def _array(self, what, value, shape):
-        array = np.require(np.ascontiguousarray(value, dtype=float), requirements="A")
+        array = np.ascontiguousarray(value, dtype=float)
+        array = array if array.flags.aligned else array.copy()
         if array.shape != shape:
             raise SpecificationError(
                 f"{what} of {self.name!r} has the shape {array.shape}.",

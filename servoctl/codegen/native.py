@@ -22,7 +22,7 @@ class Library:
     backend = "c"
 
     def __init__(self, library, symbol, n_x, n_p, n_y):
-        self._library, self._symbol = library, symbol
+        self._library, self._symbol, self._functions = library, symbol, {}
         self._grid = self.native("grid")
         self._grid.restype = None
         self._columns = 1 + n_x + n_y
@@ -34,7 +34,9 @@ class Library:
 
     def native(self, suffix):
         """The C function ``SYMBOL_suffix``."""
-        return self._library[f"{self._symbol}_{suffix}"]
+        if suffix not in self._functions:  # looking it up takes as long as a short call
+            self._functions[suffix] = self._library[f"{self._symbol}_{suffix}"]
+        return self._functions[suffix]
 
     def grid(self, t, x, p, y):
         """See `Compiled.grid`."""
@@ -107,12 +109,12 @@ class Library:
         arrays = map(argument, (cuts, x0, p))
         return run(size, *arrays, ctypes.c_double(longest), most, argument(nodes), ctypes.byref(count)), count.value
 
-    def newton(self, t, nodes, p, x, y):
-        """See `Compiled.newton`."""
+    def newton(self, t, nodes, p, z):
+        """Fill columns of z; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         run, count = self.native("newton"), ctypes.c_int64()
         run.restype = ctypes.c_int64
         sizes = ctypes.c_int64(t.size), ctypes.c_int64(len(nodes))
-        n = run(sizes[0], argument(t), sizes[1], *map(argument, (nodes, p, x, y)), ctypes.byref(count))
+        n = run(sizes[0], argument(t), sizes[1], *map(argument, (nodes, p, z)), ctypes.byref(count))
         return n, count.value
 
 

@@ -60,14 +60,18 @@ class _Algebraic(Stepping):
         self.ends = first, first + model.n, first + 2 * model.n
 
     def _levels(self, y):
-        """γ', γ'' and pivots from the outputs of `Equations.path`."""
+        """γ', γ'' and pivots from the outputs of `Equations.path`, or from these with q in place of the Newton step."""
         first, second, end = self.ends
         return y[first:second], y[second:end], y[end:]
 
-    def _split(self, q, y):
-        """State (q, γ'), γ'' and pivots from q and the outputs of `Equations.path`."""
-        rates, top, pivots = self._levels(y)
-        return np.concatenate([q, rates]), top, pivots
+    def _states(self, z):
+        """States (q, γ') from q and further outputs of `Equations.path`."""
+        return np.concatenate([z[: self.model.nq], self._levels(z)[0]])
+
+    def _jets(self, z):
+        """Jets (q, γ', γ'') from q and further outputs of `Equations.path`."""
+        first, _, end = self.ends
+        return z[:end] if first == self.model.nq else np.concatenate([z[: self.model.nq], z[first:end]])
 
     def _pivots_of(self, outputs):
         return self._levels(outputs)[2]
@@ -109,7 +113,8 @@ class _Algebraic(Stepping):
             self._fail(cuts[0], x, "Newton's method finds no solution of the program from the start")
             return cuts[0], x
         t, nq = nodes[:, 0], self.model.nq
-        states, _, pivots = self._split(nodes[:, 1 : 1 + nq].T, nodes[:, 1 + nq :].T)
+        rates, _, pivots = self._levels(nodes[:, 1 + nq :].T)
+        states = np.concatenate([nodes[:, 1 : 1 + nq].T, rates])
         if self.motion.start is None:
             self.motion.start = states[:, 0]
             self.monitor.begin(pivots[:, 0])
@@ -136,7 +141,7 @@ class _Algebraic(Stepping):
             return None
 
         def states(_, times):
-            found = self._split(*self.f.newton(times, nodes, self.p)[:2])[0]
+            found = self._states(self.f.newton(times, nodes, self.p)[0])
             return np.pad(found, ((0, 0), (0, len(times) - found.shape[1])), constant_values=np.nan)
 
         self.watch.begin(stretch.t[0])
@@ -170,8 +175,7 @@ class _Algebraic(Stepping):
         """Whether a terminal event ends the motion between nodes; the samples up to it are then recorded."""
 
         def solved(t):
-            state, top, _ = self._split(*self.f.newton(t, nodes, self.p)[:2])
-            return np.concatenate([state, top])
+            return self._jets(self.f.newton(t, nodes, self.p)[0])
 
         t = self.events.instants(np.append(nodes[:-1, 0], end))[1]
         jets = solved(t)
@@ -191,10 +195,10 @@ class _Algebraic(Stepping):
         now, self.pending = self.pending[:count], self.pending[count:]
         for first in range(0, count, BLOCK):
             block = now[first : first + BLOCK]
-            q, y, iterations = self.f.newton(block, nodes, self.p)
+            z, iterations = self.f.newton(block, nodes, self.p)
             self.motion.count(iterations=iterations)
-            solved, (rates, top, _) = q.shape[1], self._levels(y)
-            self.motion.add(self.model, block[:solved], q, rates, top)
+            solved = z.shape[1]
+            self.motion.add(self.model, block[:solved], self._jets(z))
             if solved < len(block):
                 return self._fail(block[solved], x, "Newton's method finds no solution of the program there")
             if solved:
