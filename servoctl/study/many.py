@@ -144,7 +144,7 @@ def _share_computed(part, span, method, times):
 
 def _case_table(model, starts, parameters):
     """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
-    columns = {} if parameters is None else as_columns(parameters)
+    columns = {} if parameters is None or isinstance(parameters, dict) and not parameters else as_columns(parameters)
     lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
