@@ -591,9 +591,9 @@ def sample_times(t0, t1, t_eval, knots, method=None):
         times = _default_times(t0, t1, knots)
     else:
         times = as_numbers(t_eval)
-        if times.ndim != 1 or not np.all(times[1:] > times[:-1]):
+        if times.ndim != 1 or not (times[1:] > times[:-1]).all():
             times = np.unique(times)
-        if not np.all(np.isfinite(times)):
+        if not np.isfinite(times[[0, -1]] if times.size else 0.0).all():  # the others lie between
             raise SpecificationError(
                 f"t_eval={repr(t_eval)[:150]} was given.", "It is a sequence of finite times [s].", t_eval=t_eval
             )
