@@ -210,6 +210,13 @@ class DenseStretch(Stretch):
         return instants[max(int(np.searchsorted(np.abs(instants - instants[0]), abs(t - instants[0]))) - 1, 0)]
 
 
+def strong(pivots, usual):
+    """Whether pivots (n_g, N) keep their signs, and sizes near their largest and `usual` ones (n_g,)."""
+    low, high = np.minimum.reduce(pivots, axis=1), np.maximum.reduce(pivots, axis=1)
+    least, largest = np.minimum(np.abs(low), np.abs(high)), np.maximum(-low, high)
+    return bool(((low * high > 0) & (least >= DEGRADED * np.maximum(largest, usual))).all())
+
+
 class Monitor:
     """Pivots and matrices of a model along a motion.
 
