@@ -8,7 +8,6 @@ there.
 """
 
 import ctypes
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -17,6 +16,7 @@ from servoctl.codegen.matrices import of_any_size
 from servoctl.codegen.native import pointer
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.taylor import series_loop
+from servoctl.values import frozen
 
 RTOL = 1e-7  # of the steps along which deviations are moved, and of the least size of a level of the state
 NEARBY = 1e-6  # of the size of a state: distance of the states from which deviations are taken
@@ -24,7 +24,7 @@ LEFT_OUT = 1e-3  # of a propagator over a step: its last terms, which bound thos
 MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by the linearisation
 
 
-@dataclass(frozen=True)
+@frozen
 class Deviations:
     """How deviations move along a motion, in the sizes of its states.
 
