@@ -148,7 +148,7 @@ def simulate(
 
     if not _has_internal_dynamics(model) or not _integrates(method):
         return motion(t_eval)
-    times = None if t_eval is None else _sample_times(*span, t_eval, (), method)
+    times = None if t_eval is None else sample_times(*span, t_eval, (), method)
     tolerance, own = getattr(method, "rtol", STEP_ERROR), _own_times(method, span, times)
     try:
         enough = own(FEWEST + 1)
@@ -226,7 +226,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     knots = model.require_smooth((min(span), max(span)))
     if not isinstance(method, Algebraic):
         knots = tuple(sorted({*knots, *model.ends_of_pieces((min(span), max(span))).tolist()}))
-    times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
+    times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:
         model, motion = _derived_along(model, method, drift, problem, bar)
@@ -589,7 +589,8 @@ def _default_times(t0, t1, knots):
     return np.array(sorted({*times.tolist(), *map(float, inside)}))  # np.union1d imports np.ma
 
 
-def _sample_times(t0, t1, t_eval, knots, method=None):
+def sample_times(t0, t1, t_eval, knots, method=None):
+    """The instants of the samples of a motion by a method, in its order; with the knots where none are given."""
     if t_eval is None:
         times = _default_times(t0, t1, knots)
     else:
@@ -602,7 +603,8 @@ def _sample_times(t0, t1, t_eval, knots, method=None):
             )
         window = method is not None and isinstance(as_method(method), Bounded)  # which is known with the motion
         low, high = (-np.inf, np.inf) if window else (min(t0, t1), max(t0, t1))
-        if not times.size or times[0] < low - SAME_TIME or times[-1] > high + SAME_TIME:
+        margin = SAME_TIME * max(1.0, abs(t0), abs(t1))
+        if not times.size or times[0] < low - margin or times[-1] > high + margin:
             covered = f"covers {times[0]:g} to {times[-1]:g} s" if times.size else "is empty"
             raise SpecificationError(
                 f"t_eval {covered}.",
@@ -610,6 +612,8 @@ def _sample_times(t0, t1, t_eval, knots, method=None):
                 t_eval=t_eval,
                 t_span=(t0, t1),
             )
+        if times[0] < low or times[-1] > high:  # by rounding
+            times = np.unique(np.clip(times, low, high))
     return times if t1 > t0 else times[::-1]
 
 
