@@ -243,18 +243,23 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         run = _run(model, motion, (method, drift, knots), started, t1)
         return _resample(run, times) if t_eval is not None and isinstance(method, RungeKutta) else run
 
-    try:
-        run = finished()
-    except KeyboardInterrupt:  # a motion that is computed is kept
-        with without_interruption():
-            run = finished()
-        run = _interrupted_at_its_end(run) if run.status == 0 else run
+    run = _kept(finished)
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
     if run.success and not model.flat and not motion.drifted <= DRIFTED:
         _warn_drifted(run)
     return run
+
+
+def _kept(finished):
+    """The run that a function puts together from a motion: Ctrl-C waits until it is complete."""
+    try:
+        return finished()
+    except KeyboardInterrupt:
+        with without_interruption():
+            run = finished()
+    return _interrupted_at_its_end(run) if run.status == 0 else run
 
 
 def _interrupted_at_its_end(run):
