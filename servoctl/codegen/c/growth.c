@@ -203,7 +203,7 @@ static int quiet(int64_t n, int64_t F, const double *within, const Settings *s)
 /* Whether deviations Z (F, n_x, S) from a motion at n instants, those at the first of them moved on, tell that its internal
    dynamics are not unstable. Growth is that of the states x_i/scale_i; `within` is as for `quiet`, where all other growth
    is less. 0 as well beyond moderate propagators, of which products with inverses lose digits.
-   work has S (2 F n_x + 4 F^2 + 2 n) + max(2 S n_x + F n_x S + n_x^2 + 3 n_x, S (F + 2), (3 F + 1) PADDED(F)) numbers. */
+   work has S (2 F n_x + 2 F^2 + 2 n) + max(2 S n_x + F n_x S + n_x^2 + 3 n_x, S (F + 2), (3 F + 1) PADDED(F)) numbers. */
 int64_t FN(growth)(int64_t n, int64_t n_x, int64_t F, const double *Z, const Settings *settings, double *work,
                    double *scale, double *within)
 {
