@@ -17,8 +17,10 @@ from servoctl.jets.pieces import Constant, operand_values
 
 ADDED = (0, 1, 2)  # terms by which a sum may grow where another is multiplied out: the fastest result is taken
 NOTHING = ((), 0.0)  # the term of a sum without terms
-_TRUTHS = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR}  # 0 or 1
-_DECIDING = _TRUTHS | {ca.OP_FMIN, ca.OP_FMAX, ca.OP_SIGN, ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER}
+_DECIDING = {
+    ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_SIGN, ca.OP_FMIN, ca.OP_FMAX,
+    ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER,
+}  # fmt: skip
 _SIGNS = {ca.OP_ADD: (1.0, 1.0), ca.OP_SUB: (1.0, -1.0), ca.OP_NEG: (-1.0,)}
 _POWERS = {
     ca.OP_MUL: (1.0, (1, 1)), ca.OP_SQ: (1.0, (2,)), ca.OP_TWICE: (2.0, (1,)), ca.OP_DIV: (1.0, (1, -1)),
@@ -114,14 +116,12 @@ class _Collected:
             self.values[target] = {functools.reduce(_joined, (_power(m, n) for m, _, n in factors)): c}
 
     def of_function(self, operation, terms):
-        """The polynomial of a function of terms (monomial, coefficient); of what holds or vanishes, without its number.
+        """The polynomial of a function of terms (monomial, coefficient).
 
-        What vanishes unless two conditions hold, one of them twice, is written with each condition once.
+        What vanishes unless a condition holds has the number of what then holds, and each condition once.
         """
-        if operation == ca.OP_NE and terms[1] == NOTHING and self.is_truth(terms[0]):
-            return dict(terms[:1])
         scale = 1.0
-        if operation == ca.OP_IF_ELSE_ZERO and self.is_truth(terms[0]):
+        if operation == ca.OP_IF_ELSE_ZERO:
             condition, (monomial, scale) = terms
             if condition in self.conditions(monomial):
                 return {monomial: scale}
@@ -130,11 +130,6 @@ class _Collected:
         if operation in (ca.OP_SIN, ca.OP_COS):
             self.angles.setdefault(terms, {})[operation] = atom
         return {((atom, 1),): scale}
-
-    def is_truth(self, term):
-        """Whether a term is 0 or 1 by its operation."""
-        key = self.key_of(term[0])
-        return term[1] == 1 and isinstance(key, tuple) and key[0] in _TRUTHS
 
     def conditions(self, monomial):
         """The conditions without which an atom vanishes."""

@@ -80,7 +80,7 @@ def select(condition, yes, no):
 
 
 def holds(a):
-    """Whether an SX condition, as 1 or 0, or entries of an array differ from zero; a comparison is 1 or 0 itself."""
+    """Whether an SX condition (as 1 or 0; a comparison is that itself) or the entries of an array differ from zero."""
     return a if isinstance(a, ca.SX) and a.op() in _TRUTHS else a != 0
 
 

@@ -7,7 +7,7 @@ ends. Samples are solved between the ends of these steps.
 import numpy as np
 
 from servoctl.jets.branches import Branches
-from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch
+from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch, strong
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.watch import Watch
 from servoctl.model.switching import switching
@@ -83,14 +83,36 @@ class _Algebraic(Stepping):
         """Follow the solution from x0 at t0 to t1 [s], and solve at each of the times (N,) [s]."""
         with interruptible(self.motion):
             self._watch(t0, x0, t1)
-            self._start(t0, x0, t1)
             cuts = np.array(breakpoints((t0, t1), knots))
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
+            if self._at_once(cuts, x0, times):
+                return self.motion
+            self._start(t0, x0, t1)
             self.pending, self.resumed, self.motion.room = times, None, len(times)
             t, x = t0, x0
             while t != t1 and self.motion.stop is None and not self.motion.ended:
                 t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)
         return self.motion
+
+    def _at_once(self, cuts, x0, times):
+        """Take a motion whose steps and pivots are all in order; False if one of them must be inspected."""
+        if self.family is not None or self.events is not None or len(times) > BLOCK:
+            return False
+        nq = self.model.nq
+        nodes, followed = self.f.continuation(cuts, x0[:nq], self.p, self.longest, NODES)
+        if not 0 < len(nodes) < NODES or nodes[-1, 0] != cuts[-1]:
+            return False
+        outputs = nodes.T[1 + nq :]
+        if not strong(self._levels(outputs)[2], self.model.pivot_sizes):
+            return False
+        z, solved = self.f.newton(times, nodes, self.p)
+        if z.shape[1] < len(times):
+            return False
+        self.motion.fill(self.model, times, self._jets(z))
+        self.motion.start = np.concatenate([nodes[0, 1 : 1 + nq], self._levels(outputs[:, 0])[0]])
+        self.motion.count(iterations=followed + solved, steps=len(nodes) - 1)
+        self.progress(cuts[-1])
+        return True
 
     def _watch(self, t, x, t1):
         """Watch for kinks and switches of the motion, if it has any, with the smooth model that holds at the start.

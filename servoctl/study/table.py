@@ -4,7 +4,7 @@ import functools
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from importlib import metadata
 
 import numpy as np
@@ -15,12 +15,13 @@ from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
 from servoctl.units import unit_of_column, with_unit
+from servoctl.values import frozen
 from servoctl.version import __version__
 
 SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Study(Shown):
     """A table of results; made by `tradeoff`, `levels`, `stability`, `sweep` or `load_study`.
 
@@ -203,17 +204,16 @@ def _clipped(line):
 
 def machine():
     """The machine that computes: processor, cores, system, compiler and versions, as a dict of plain values."""
-    versions = {name: _version(name) for name in ("casadi", "numpy", "scipy")}
     return {
         "processor": _processor(),
-        "cores": os.cpu_count(),
+        "cores": _cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "compiler": compiler() or "none: loops are interpreted",
-        "versions": {"servoctl": __version__, "python": platform.python_version()} | versions,
+        "versions": dict(_versions()),
     }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Traced(Shown):
     """A table with a row per case, and traces of signals at common instants.
 
@@ -237,8 +237,12 @@ class Traced(Shown):
 
 
 @functools.cache
-def _version(package):
-    return metadata.version(package)
+def _versions():
+    others = {name: metadata.version(name) for name in ("casadi", "numpy", "scipy")}
+    return {"servoctl": __version__, "python": platform.python_version()} | others
+
+
+_cores = functools.cache(os.cpu_count)
 
 
 @functools.cache
