@@ -6,6 +6,7 @@
 #include "series.h"
 #include "cases.h"
 
+#define UNROLLED _Pragma("GCC unroll 32") /* a loop whose conditions are decided when it is compiled */
 #define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
 
 typedef struct {
@@ -40,7 +41,7 @@ INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     W largest = ALL(0.0);
     int some = 0;
-    for (int64_t i = 0; i < n; i++) {
+    UNROLLED for (int64_t i = 0; i < n; i++) {
         if (level && !IS_FREE((level - 1) * N + i)) continue;
         largest = some ? w_larger_size(w_fabs(v[i]), largest) : w_fabs(v[i]);
         some = 1;
@@ -53,7 +54,7 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_r
 {
     const W scale = w_rough_log2(least + w_largest(x, n, level));
     W shortest = ALL(INFINITY);
-    for (int64_t m = 0; m < TERMS; m++) {
+    UNROLLED for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
         if (k <= level || k == 0) continue;
         const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, level));
@@ -64,12 +65,15 @@ INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_r
     return shortest;
 }
 
-/* gamma^(j) or, for j = 0, the change of q, a time h after the expansion. */
+/* gamma^(j) or, for j = 0, the change of q, a time h after the expansion: by W. G. Horner's scheme, in which h has the
+   ratio of the factors of two terms. */
 INLINE W w_series(const W *c, int64_t n, int64_t i, int64_t j, W h)
 {
-    W total = falling(LAST, j) * c[(LAST - 1) * n + i];
-    for (int64_t k = LAST - 1; k >= (j ? j : 1); k--) total = total * h + falling(k, j) * c[(k - 1) * n + i];
-    return j ? total : total * h;
+    W total = c[(LAST - 1) * n + i];
+    UNROLLED for (int64_t k = LAST - 1; k >= (j ? j : 1); k--) {
+        total = total * (falling(k + 1, j) / falling(k, j) * h) + c[(k - 1) * n + i];
+    }
+    return j ? falling(j, j) * total : total * h;
 }
 
 /* By how much the noted points violate the invariants: of a case the larger one of start and end counts. */
@@ -161,11 +165,11 @@ INLINE I falling_pivots(Motions *s)
 INLINE I off(const Motions *s, const W *c, double rtol)
 {
     I wrong = w_bits(ALL(0.0));
-    for (int64_t j = 0; j < TOP; j++) {
+    UNROLLED for (int64_t j = 0; j < TOP; j++) {
         W error = ALL(0.0), size = j ? w_largest(s->x + NQ + (j - 1) * N, N, 0) : w_largest(s->x, NQ, 0);
         W part = ALL(falling(LAST, j) / falling(LAST, TOP - 1));
         for (int64_t m = j; m < TOP; m++) part *= s->h;
-        for (int64_t i = 0; i < N; i++) {
+        UNROLLED for (int64_t i = 0; i < N; i++) {
             if (highest_level(i) != j) continue;
             const W now = falling(TOP, TOP) * c[(TOP - 1) * N + i];
             error = w_larger_size(error, w_fabs(part * (now - s->ahead[i])));
@@ -202,14 +206,14 @@ void FN(many)(Many *m)
         W x[NX + 1];
         const I ends = h_long >= left * (1 - 1e-12);
         W h = forward * w_select(ends, left, h_long);
-        for (int64_t i = 0; i < NX; i++) {
+        UNROLLED for (int64_t i = 0; i < NX; i++) {
             const int64_t j = i < NQ ? 0 : 1 + (i - NQ) / N;
             x[i] = s.x[i];
             if (j && !IS_FREE(i - NQ)) continue; /* rows determine it in the next expansion */
             const W part = j ? w_series(c, N, (i - NQ) % N, j, h) : w_series(s.y, NQ, i, 0, h);
             x[i] = j ? part : s.x[i] + part;
         }
-        for (int64_t i = 0; i < N; i++) s.ahead[i] = w_series(c, N, i, TOP, h);
+        UNROLLED for (int64_t i = 0; i < N; i++) s.ahead[i] = w_series(c, N, i, TOP, h);
         W sum = ALL(0.0);
         for (int64_t i = 0; i < NX; i++) sum += x[i] * 0.0;
         const I stuck = ~(h_long > 1e-13 * (1.0 + w_fabs(s.t))) | (sum != 0) | (s.steps >= m->max_steps);
