@@ -50,7 +50,8 @@ def library(text, level="-O1", exact=False):
     text : str
         C text.
     level : str
-        Optimisation level. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
+        Optimisation level, perhaps with further flags behind it. "-O1" compiles fastest, and its straight-line code is
+        at most a quarter slower than "-O3".
     exact : bool
         Whether the results are those of the operations one by one, without contraction.
 
@@ -62,7 +63,7 @@ def library(text, level="-O1", exact=False):
     command, identity = _compiler()
     if command is None:
         return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
-    flags = (level, *FLAGS, *(ROUNDED if exact else ()))
+    flags = (*level.split(), *FLAGS, *(ROUNDED if exact else ()))
     parts = (text, digest(), *flags, *_optional_flags(), identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:

@@ -305,10 +305,11 @@ class Interpreter:
         return k, path.count
 
     @np.errstate(all="ignore")
-    def newton(self, t, nodes, p, x, y):
-        """Fill columns of x and y; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
+    def newton(self, t, nodes, p, z):
+        """Fill columns of z; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         path, k, alone = self._path(p), 0, 0
-        parts = np.zeros(BLOCK), np.zeros((BLOCK, len(x))), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, len(y)))
+        (_, n_x, _, n_y), rows = self._parts, len(z)
+        parts = np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, n_y))
         call = connected(self._block, parts) if t.size >= BLOCK else None
         forward = nodes[-1, 0] >= nodes[0, 0]
         ends = nodes[1:, 0] if forward else -nodes[1:, 0]
@@ -318,14 +319,14 @@ class Interpreter:
             block = slice(k, k + BLOCK)
             if alone <= k <= t.size - BLOCK:
                 if path.together(t[block], nodes[first[block]], nodes[last[block]], parts, call[0]):
-                    x[:, block], y[:, block] = parts[1].T, parts[3].T
+                    z[:n_x, block], z[n_x:, block] = parts[1].T, parts[3][:, n_x:rows].T
                     k += BLOCK
                     continue
                 alone = k + BLOCK
             point = path.between(t[k], nodes[first[k]], nodes[last[k]])
             if point is None:
                 break
-            x[:, k], y[:, k] = point
+            z[:n_x, k], z[n_x:, k] = point[0], point[1][n_x:rows]
             k += 1
         return k, path.count
 

@@ -33,7 +33,7 @@ class Library:
 
     def native(self, suffix):
         """The C function ``SYMBOL_suffix``."""
-        return self._library[f"{self._symbol}_{suffix}"]
+        return getattr(self._library, f"{self._symbol}_{suffix}")
 
     def grid(self, t, x, p, y):
         """See `Compiled.grid`."""
@@ -70,11 +70,11 @@ class Library:
 
     def whole(self, t1, tolerances, most, times, net, sizes):
         """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
-        task, (inside, distance), count = self.workspace.steps, net, len(times)
+        task, (inside, *net), count = self.workspace.steps, net, len(times)
         task.of(float(t1), *tolerances, 0.0, most, None)
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
-        samples = np.array([count, len(inside), 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
-        samples.view(float)[2] = distance
+        samples = np.array([count, len(inside), 0, 0, 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
+        samples.view(float)[2:5] = net
         steps = self._whole(task.pointer, argument(samples))
         return (steps, jets, facts) if steps >= 0 else None
 
@@ -98,12 +98,12 @@ class Library:
         arrays = map(argument, (cuts, x0, p))
         return run(size, *arrays, ctypes.c_double(longest), most, argument(nodes), ctypes.byref(count)), count.value
 
-    def newton(self, t, nodes, p, x, y):
-        """See `Compiled.newton`."""
+    def newton(self, t, nodes, p, z):
+        """Fill columns of z; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         run, count = self.native("newton"), ctypes.c_int64()
         run.restype = ctypes.c_int64
         sizes = ctypes.c_int64(t.size), ctypes.c_int64(len(nodes))
-        n = run(sizes[0], argument(t), sizes[1], *map(argument, (nodes, p, x, y)), ctypes.byref(count))
+        n = run(sizes[0], argument(t), sizes[1], *map(argument, (nodes, p, z)), ctypes.byref(count))
         return n, count.value
 
 

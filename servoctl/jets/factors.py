@@ -1,12 +1,12 @@
 """Constant factors of products: a coefficient of (a x) (b y) takes one product by a b in place of one in each term."""
 
 from copy import copy
-from dataclasses import dataclass
 
 from servoctl.jets.tape import Node
+from servoctl.values import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class _Product:
     """number · constant · node, where `constant` is a node without time derivatives, or None."""
 

@@ -15,7 +15,7 @@ from math import factorial, prod
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.tape import REAL, Scalars, add, apply, divide, finite, multiply, select, subtract
+from servoctl.jets.tape import REAL, Scalars, add, apply, divide, finite, holds, multiply, select, subtract
 
 _NUMBERS = (float, int)
 OVERFLOWING = 1e100  # a divisor beyond it, of which a coefficient has overflown, is infinite
@@ -162,7 +162,7 @@ class Series:
         if node.kind == "fabs":
             return select(self._deciding(node.args[0]) >= 0, a[k], -a[k])
         if node.kind == "gate":
-            return 0.0 if is_zero(b[k]) else select(a[0] != 0, b[k], 0.0)
+            return 0.0 if is_zero(b[k]) else select(holds(a[0]), b[k], 0.0)
         first_is_least = self._deciding(node.args[0]) <= self._deciding(node.args[1])
         return select(first_is_least, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
 

@@ -79,6 +79,11 @@ def select(condition, yes, no):
     return np.where(condition, yes, no)
 
 
+def holds(a):
+    """Whether an SX condition (as 1 or 0; a comparison is that itself) or the entries of an array differ from zero."""
+    return a if isinstance(a, ca.SX) and a.op() in _TRUTHS else a != 0
+
+
 def finite(a):
     """Whether an SX expression, as 1 or 0, or the entries of an array are finite."""
     return ca.fabs(a) <= sys.float_info.max if isinstance(a, ca.SX) else np.isfinite(a)
@@ -99,6 +104,7 @@ _CONSTANT = {  # piecewise constant: their derivatives are zero
     ca.OP_LT: "lt", ca.OP_LE: "le", ca.OP_EQ: "eq", ca.OP_NE: "ne", ca.OP_AND: "logic_and", ca.OP_OR: "logic_or",
     ca.OP_NOT: "logic_not", ca.OP_SIGN: "sign",
 }  # fmt: skip
+_TRUTHS = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT}
 _FUNCTION = {  # y' = sum of g * a' with y_0 = f(a_0): each is one "quadrature" node
     ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_ASIN: "asin",
     ca.OP_ACOS: "acos", ca.OP_ATAN: "atan", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_TANH: "tanh",

@@ -1,8 +1,9 @@
 """What all integrations share: the pieces of a motion, and the change of pivots that the rank monitor requires."""
 
 import contextlib
-import signal
 import threading
+from _signal import SIGINT, getsignal  # `signal` makes enumerations of them, which takes ten times as long
+from _signal import signal as set_signal
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +13,7 @@ from servoctl.methods.choice import MinimalCoordinates, Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
+from servoctl.values import frozen
 
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
@@ -137,15 +139,15 @@ def interruptible(motion):
 @contextlib.contextmanager
 def without_interruption():
     """Ctrl-C waits until the end; the list is not empty if it came."""
-    pressed, before = [], signal.getsignal(signal.SIGINT)
+    pressed, before = [], getsignal(SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield pressed
         return
-    signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    set_signal(SIGINT, lambda number, frame: pressed.append(number))
     try:
         yield pressed
     finally:
-        signal.signal(signal.SIGINT, before)
+        set_signal(SIGINT, before)
 
 
 def margin_at(t, span):
@@ -170,7 +172,7 @@ def equal_steps(a, b, step):
     return (b - a) / count, count
 
 
-@dataclass(frozen=True)
+@frozen
 class Cubics:
     """A motion through states x (n_x, S + 1) with rates (n_x, S + 1) at times t (S + 1,), by Hermite's polynomials."""
 

@@ -6,7 +6,7 @@ motion by one solve with the same L.
 """
 
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from math import factorial, perm
 
@@ -23,10 +23,11 @@ from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import LEAVES, RESOLUTION, End, Tolerance, net, steps_of
+from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
 from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate
+from servoctl.values import frozen
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -448,20 +449,18 @@ class TaylorSteps(Stepping):
         if not plain or any(what is not None for what in watched):
             return False
         p, net = np.append(model.parameters, (t0 + t1) / 2), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT))
-        whole = self.f.whole((t0, x0, t1), p, self.tolerances, self.most, t_eval, net)
+        judged = resolved(*self.tolerances)
+        whole = self.f.whole((t0, x0, t1), p, self.tolerances, self.most, t_eval, net, judged)
         if whole is None or whole[0] == self.most:
             return False
-        steps, jets, (farthest, longest, states, residuals, least, most, first, drifted) = whole
+        steps, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
         if "settled" not in self.f.others:
             top = self.rates.grid(t_eval, jets[: self.n_x], model.parameters)[self.n_x - self.n : self.n_x]
             farthest = np.maximum(farthest, np.abs(top - jets[-self.n :]).max(axis=1, initial=0.0))
             jets[-self.n :] = top
-        if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(jets).all():
+        if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(farthest).all():
             return False
-        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any():
-            return False
-        slopes, tolerance = first[len(residuals) :].reshape(self.n_x, -1).T, Tolerance(model, *self.tolerances)
-        if not (residuals <= LEAVES * tolerance.of(slopes[:, :, None], x0[:, None])[:, 0]).all():
+        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any() or not (residuals <= LEAVES).all():
             return False
         self.motion.fill(model, t_eval, jets)
         self.motion.largest, self.motion.drifted = states, float(drifted[0])
@@ -659,7 +658,7 @@ class TaylorSteps(Stepping):
         return pending[~due]
 
 
-@dataclass(frozen=True)
+@frozen
 class _Log:
     """Steps of the method with the series at their starts, as `Compiled.taylor` returns them."""
 

@@ -9,7 +9,7 @@ import casadi as ca
 
 from servoctl.jets.branches import cse
 from servoctl.jets.series import Series
-from servoctl.jets.tape import Tape, add, divide, multiply
+from servoctl.jets.tape import Tape, add, divide, holds, multiply
 
 SIGNS = {"add": 1.0, "sub": -1.0}  # of the second term
 
@@ -75,7 +75,7 @@ def _form(node, forms, c):
     if kind == "div" and moving == [a]:
         return _scaled(forms[a], lambda x: divide(x, c[b][0]))
     if kind == "gate" and moving == [b]:
-        return _scaled(forms[b], lambda x: multiply(ca.SX(c[a][0]) != 0, x))
+        return _scaled(forms[b], lambda x: multiply(holds(ca.SX(c[a][0])), x))
     if kind in ("neg", "scale", "copy"):
         factor = {"neg": -1.0, "scale": data, "copy": 1.0}[kind]
         return _scaled(forms[a], lambda x: multiply(factor, x))

@@ -4,7 +4,6 @@ import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,17 +21,18 @@ from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
-from servoctl.simulation import OFF, as_state, simulated
+from servoctl.simulation import OFF, as_state, sample_times, simulated
 from servoctl.study.cases import FAILURE, as_columns
 from servoctl.study.signals import Signals
 from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
 from servoctl.study.table import Study, Traced, machine, table
+from servoctl.values import frozen
 
 FINAL = "final "  # names of values at the end
 SHARES = 16  # of the cases, which the workers of an executor share
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Motions(Traced):
     """The motions of many cases; made by `simulate_many`.
 
@@ -144,7 +144,7 @@ def _share_computed(part, span, method, times):
 
 def _case_table(model, starts, parameters):
     """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
-    columns = {} if parameters is None else as_columns(parameters)
+    columns = {} if parameters is None or isinstance(parameters, dict) and not parameters else as_columns(parameters)
     lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
@@ -167,15 +167,7 @@ def _case_table(model, starts, parameters):
 
 
 def _trace_times(span, t_eval):
-    times = np.unique(as_numbers([] if t_eval is None else t_eval))
-    if times.size and not (np.isfinite(times).all() and min(span) <= times[0] and times[-1] <= max(span)):
-        raise SpecificationError(
-            f"t_eval={repr(t_eval)[:150]} was given.",
-            f"Samples are finite times within t_span, {min(span):g} to {max(span):g} s.",
-            t_eval=t_eval,
-            t_span=span,
-        )
-    return times if span[1] > span[0] else times[::-1]
+    return np.array([]) if t_eval is None or not np.size(t_eval) else sample_times(*span, t_eval, ()).copy()
 
 
 def _with_end(times, span):
