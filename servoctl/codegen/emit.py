@@ -16,6 +16,7 @@ import casadi as ca
 from servoctl.codegen.chains import short_chains, time_of
 from servoctl.codegen.collecting import collected, ways
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
+from servoctl.codegen.scaling import is_still, scaled
 from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
 from servoctl.jets.branches import apply_code
 from servoctl.jets.lookup import lookup_at, lookups
@@ -26,6 +27,7 @@ WIDE = 3000  # operations: up to here a function is emitted for eight points at 
 COLLECTED = 2000  # operations: up to here collecting like terms takes 0.2 s, and compiling less by as much
 SHARED = 2  # divisions by the same value: from here on they become products with its reciprocal
 PHASES = ("instant", "correction", "rest")  # of t and p alone; for a Newton correction; for the other outputs
+SERIES = ("still", "moving")  # of p alone; all others
 SCALAR_FASTER = '#pragma GCC optimize("no-tree-slp-vectorize")\n'  # pairs of terms of a series cost more to gather
 
 _ARITHMETIC = {
@@ -91,6 +93,8 @@ class Dialect:
         Whether each evaluation waits for the one before: the statements of one chunk are those of `short_chains`.
     collected : bool
         Whether like terms of these are collected before.
+    scaled : bool
+        Whether the statements are those of `scaled`.
     """
 
     number: str = "double"
@@ -103,6 +107,7 @@ class Dialect:
     whole: bool = False
     chained: bool = False
     collected: bool = False
+    scaled: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -232,8 +237,10 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
     step = f.numel_in(1) if "newton" in loops else 0
 
-    def emitted(f, name, dialect):
-        return phases(f, name, given, dialect, chunk) if f is phased else function(f, name, dialect, chunk)
+    def emitted(part, name, dialect):
+        if part is phased:
+            return phases(f, name, given, dialect, chunk)
+        return (series if part is f and "taylor" in loops else function)(part, name, dialect, chunk)
 
     phased = f if PHASED.intersection(loops) else None
     given = None if phased is None else by_phase(f, step)
@@ -318,24 +325,43 @@ def _time_of_newton(phases):
 
 
 def phases(f, name, given, dialect=SCALAR, chunk=CHUNK):
-    """C text of one function y = f(t, x, p) in phases, `given` by `by_phase`.
+    """C text of one function y = f(t, x, p) in phases, `given` by `by_phase`, which share a vector w.
 
-    They share a vector w of ``WORK`` numbers: ``name_instant`` computes what depends on t and p alone,
-    ``name_correction`` the step of Newton's method, ``name_rest`` the other outputs. At one instant, corrections of
-    several x may precede the rest, which completes the last one.
+    ``name_instant`` computes what depends on t and p alone, ``name_correction`` the step of Newton's method,
+    ``name_rest`` the other outputs. At one instant, corrections of several x may precede the rest, which completes
+    the last one.
     """
     statements, tables = given
-    tables = _with_lookups(tables, f, dialect)
-    parts = [_cut(part, chunk) for part in statements]
-    wholes = [f"{name}_{phase}" for phase in PHASES]
+    return "".join(_with_lookups(tables, f, dialect)) + _in_phases(name, PHASES, statements, dialect, chunk)
+
+
+def series(f, name, dialect=SCALAR, chunk=CHUNK):
+    """C text of one function y = f(t, x, p) of Taylor coefficients in two phases, which share a vector w.
+
+    ``name_still`` computes what depends on p alone, ``name_moving`` the outputs.
+    """
+    statements, tables = _prepared(f, replace(dialect, scaled=True))
+    still, parts = set(), ([], [])
+    for statement in statements:
+        target, _, operands = statement
+        alone = isinstance(target, int) and all(is_still(v, still) for v in operands)
+        still.update([target] if alone else [])
+        parts[not alone].append(statement)
+    return "".join(tables) + _in_phases(name, SERIES, parts, dialect, chunk)
+
+
+def _in_phases(name, phases, parts, dialect, chunk):
+    """C text of a function in phases, each with its statements, and of the function that calls all of them."""
+    parts = [_cut(part, chunk) for part in parts]
+    wholes = [f"{name}_{phase}" for phase in phases]
     names = [[f"{w}_{k}" for k in range(len(c))] if len(c) > 1 else [w] for w, c in zip(wholes, parts, strict=True)]
     of = [k for k, chunks in enumerate(parts) for _ in chunks]
     text, size = _sharing(list(chain(*names)), list(chain(*parts)), of, dialect)
     static = replace(dialect, linkage="static ")
     for whole, some in zip(wholes, names, strict=True):
         text += static.head(whole, work=True) + _calls(some) + "}\n" if len(some) > 1 else ""
-    all_three = dialect.head(name) + f"    {dialect.number} w[WORK];\n" + _calls(wholes) + "}\n"
-    return f"{''.join(tables)}\n#define WORK {size}\n{text}{all_three}"
+    together = dialect.head(name) + f"    {dialect.number} w[WORK];\n" + _calls(wholes) + "}\n"
+    return f"\n#define WORK {size}\n{text}{together}"
 
 
 def function_of_several(f, name, dialect, suffixes):
@@ -355,6 +381,7 @@ def _prepared(f, dialect, suffix=""):
     if not dialect.exact:
         chained = dialect.chained and len(statements) <= CHUNK
         some = ways(statements) if chained and dialect.collected else [statements]
+        statements = scaled(statements) if dialect.scaled else statements
         statements = min(map(short_chains, some), key=time_of) if chained else _with_reciprocals(statements)
     return statements, _with_lookups(tables, f, dialect)
 

@@ -430,7 +430,7 @@ class Compiled:
         atol, weights = (atol, None) if isinstance(atol, float) else weighted(atol)
         return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
 
-    def whole(self, start, p, tolerances, most, times, net):
+    def whole(self, start, p, tolerances, most, times, net, judged):
         """A whole motion by the Taylor method in one call, with what shows whether nothing along it needs a decision.
 
         Parameters
@@ -446,6 +446,8 @@ class Compiled:
             Samples in the order of the motion [s].
         net : ((M,) array, float)
             Where series are compared with the equations: parts of each step, and a distance of instants [s].
+        judged : (rtol, atol)
+            Of the states, which judge "invariants".
 
         Returns
         -------
@@ -454,20 +456,20 @@ class Compiled:
             q, γ', ..., γ^(s̄) at the samples, by "settled" if there is one.
         facts : list of arrays
             How far γ^(s̄) of the series is from that of "rates" (n,), the longest step (1,), the largest sizes of the
-            states (n_x,) and, after the start, of "invariants" (m,), the least size of each pivot, 0 where its sign
-            changes, and the largest one, the outputs of "invariants" at the start, and (1,) the largest of them at the
-            end, relative to its gradient times the state.
+            states (n_x,) and, after the start, of "invariants" relative to their tolerances there (m,), the least size
+            of each pivot, 0 where its sign changes, and the largest one, and (1,) the largest of the "invariants" at
+            the end, relative to its gradient times the state.
         None
-            If the steps do not reach the end, or nothing is compiled.
+            If the steps do not reach the end, samples are not finite, or nothing is compiled.
         """
         self._require_loop("taylor")
         self._place(self._library, start[0], start[1], p)
         n, m, sizes = self.sizes["n"], self.sizes["invariants"], self.sizes
         pivots = self.n_y - sizes["last"] * (n + (0 if sizes["plain"] else sizes["nq"]))
-        lengths = n, 1, self.n_x, m, pivots, pivots, m * (1 + self.n_x), 1
+        lengths = n, 1, self.n_x, m, pivots, pivots, 1
         rows = sizes["nq"] + sizes["top"] * n
         times = np.ascontiguousarray(times, dtype=float)
-        found = self._library.whole(start[2], tolerances, most, times, net, (rows, sum(lengths)))
+        found = self._library.whole(start[2], tolerances, most, times, (*net, *judged), (rows, sum(lengths)))
         if found is None:
             return None
         ends = list(itertools.accumulate(lengths, initial=0))

@@ -22,10 +22,9 @@ class Library:
     backend = "c"
 
     def __init__(self, library, symbol, n_x, n_p, n_y):
-        self._library, self._symbol, self._functions = library, symbol, {}
+        self._library, self._symbol = library, symbol
         self._grid = self.native("grid")
         self._grid.restype = None
-        self._columns = 1 + n_x + n_y
         self.workspace = Workspace(n_x, n_p, n_y, self._connect)
 
     def _connect(self, row, parts):
@@ -34,9 +33,7 @@ class Library:
 
     def native(self, suffix):
         """The C function ``SYMBOL_suffix``."""
-        if suffix not in self._functions:  # looking it up takes as long as a short call
-            self._functions[suffix] = self._library[f"{self._symbol}_{suffix}"]
-        return self._functions[suffix]
+        return getattr(self._library, f"{self._symbol}_{suffix}")
 
     def grid(self, t, x, p, y):
         """See `Compiled.grid`."""
@@ -61,13 +58,9 @@ class Library:
 
     def taylor(self, ends, rtol, atol, every, max_steps, weights=None):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
-        workspace = self.workspace
-        log, task = workspace.log(max_steps + 1, self._columns), workspace.task
-        workspace.until(ends)
-        if weights is not workspace.weights:
-            workspace.weigh(weights)
-        task[1], task[2], task[3], task[4] = rtol, atol, every, max_steps
-        return log[: self._taylor(workspace.pointer) + 1].copy()
+        steps = self.workspace.steps
+        steps.of(ends, rtol, atol, every, max_steps, weights)
+        return steps.log[: self._taylor(steps.pointer) + 1].copy()
 
     @functools.cached_property
     def _taylor(self):
@@ -77,16 +70,12 @@ class Library:
 
     def whole(self, t1, tolerances, most, times, net, sizes):
         """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
-        workspace, (inside, distance), count = self.workspace, net, len(times)
-        workspace.log(most + 1, self._columns)
-        task = workspace.task
-        workspace.until(float(t1))
-        workspace.weigh(None)
-        (task[1], task[2]), task[3], task[4] = tolerances, 0.0, most
+        task, (inside, *net), count = self.workspace.steps, net, len(times)
+        task.of(float(t1), *tolerances, 0.0, most, None)
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
-        samples = np.array([count, len(inside), 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
-        samples.view(float)[2] = distance
-        steps = self._whole(workspace.pointer, argument(samples))
+        samples = np.array([count, len(inside), 0, 0, 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
+        samples.view(float)[2:5] = net
+        steps = self._whole(task.pointer, argument(samples))
         return (steps, jets, facts) if steps >= 0 else None
 
     @functools.cached_property

@@ -210,7 +210,7 @@ def _source(f, off_manifold, n_x):
     sizes |= {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "FAR_OFF": FAR_OFF}
     settled = f.others.get("settled")
     sizes |= {} if settled is None else {"SETTLED": ""}
-    expansion = emit.function(f.expression, "expansion", emit.LANES, chunk)  # in one piece values stay in registers
+    expansion = emit.series(f.expression, "expansion", emit.LANES, chunk)  # in one piece values stay in registers
     parts = [emit.unit(sizes), emit.include("lanes.h"), expansion]
     parts += [emit.function(off_manifold.expression, "off_manifold", emit.LANES)]
     parts += [] if settled is None else [emit.function(settled, "servoctl_settled", emit.PORTABLE)]

@@ -13,23 +13,20 @@ from math import factorial, perm
 import casadi as ca
 import numpy as np
 
-from servoctl.codegen import emit
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.interpreted import weighted
-from servoctl.errors import SingularProgram
 from servoctl.jets.factors import constants_outside
-from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
+from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import LEAVES, RESOLUTION, End, Tolerance, net, steps_of
+from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
 from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
-from servoctl.reduction.rows import Row
+from servoctl.reduction.ranks import clean, eliminate
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -37,7 +34,6 @@ FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series o
 STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
 LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
-PRODUCTS = {"mul": 1.0, "div": 1.0, "quad": 1.0, "power": 1.0, "sq": 0.5, "sqrt": 0.5}  # of series in an operation
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
@@ -144,121 +140,61 @@ class _Motion(Motion):
         return shifted(self.gamma[level + j][i], level, j)
 
 
-def solved_for(equations):
-    """Velocities that rows determine: for each level below s̄ rows, the entries of γ^(k) they give, and pivots.
-
-    A row of order k or less is linear in γ^(k). Those entries are not integrated: what is integrated satisfies the row
-    with the tolerance, what is solved for to rounding. They are chosen so that all pivots are constant or watched.
-    """
-    r, solved = equations.r, {}
-    for k in range(1, equations.top if r.cascade is None and not equations.definite else 1):
-        rows = [a for a, row in enumerate(r.rows) if row.order + (not row.affine) <= k]
-        matrix = r.leading[rows, :]
-        numbers = clean(*r.points.matrix(matrix))
-        try:
-            order = [(rows.index(i), j) for i, j in r.order if i in rows] or pivot_order(matrix, numbers)
-            columns = sorted(j for _, j in order)
-            order = tuple((i, columns.index(j)) for i, j in order)
-            with noting_dropped() as entries:
-                _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns], order=order)
-        except SingularProgram:
-            continue
-        if rows and not entries and all(_watched(pivot, equations) for pivot in pivots):
-            solved[k] = rows, columns, order
-    return solved
-
-
-def _watched(pivot, equations):
-    """Whether a pivot is constant, or equals one that is watched up to its sign."""
-    others = [other for _, other in equations.all_pivots]
-    return not ca.symvar(pivot) or any(vanish(v) for o in others for v in spread([pivot - o, pivot + o]))
-
-
-def _in_independent(equations, solved):
-    """The rows with what rows of order 0 and 1 determine put into the others, and L; None if no products fall away.
-
-    A balance with x'' cos θ + y'' sin θ of what rolls has twice the products of series as that of the angles alone.
-    """
-    r, q = equations.r, equations.q
-    if solved is None or equations.top != 2 or r.order:
-        return None
-    inside, columns, _ = solved
-    others = [a for a in range(len(r.rows)) if a not in inside]
-    velocities, accelerations = (_dependent(equations, solved, level) for level in (1, 2))
-    given = ca.vertcat(*(ca.vertcat(*(q.gamma(k)[j] for j in columns)) for k in (2, 1)))
-    found = ca.vertcat(ca.substitute(accelerations, given[len(columns) :], velocities), velocities)
-    put = ca.substitute(ca.vertcat(*(r.rows[a].expression for a in others)), given, found)
-    ways = []
-    for way in emit.other_ways(equations.function("rows", equations.jets, [put])):
-        rows = list(r.rows)
-        for a, expression in zip(others, way.elements(), strict=True):
-            rows[a] = Row(expression, rows[a].order, rows[a].name, rows[a].kind)
-        ways.append(rows)
-    products, _ = _products(q, r.rows)
-    cost, rows = min(((_products(q, way), way) for way in ways), key=lambda pair: pair[0], default=((products,), ()))
-    if cost[0] >= products:
-        return None
-    leading = ca.vertcat(*(row.gradient(q) for row in rows))
-    with noting_dropped() as entries:
-        _, pivots = eliminate(leading, ca.SX(len(rows), 0), clean(*r.points.matrix(leading)))
-    return (rows, leading) if not entries and all(_watched(pivot, equations) for pivot in pivots) else None
-
-
-def _dependent(equations, solved, level):
-    """The velocities or accelerations that rows determine, by the others."""
-    (rows, columns, order), r = solved, equations.r
-    given = ca.vertcat(*(equations.q.gamma(level)[j] for j in columns))
-    right = ca.vertcat(*(equations.levels[a][level - r.rows[a].order] for a in rows))
-    matrix = r.leading[rows, columns]
-    numbers = clean(*r.points.matrix(matrix))
-    return eliminate(matrix, -ca.substitute(right, given, ca.SX.zeros(len(columns))), numbers, order=order)[0]
-
-
-def _products(q, rows):
-    """The number of products of series in rows, where one with itself counts half, and that of all operations."""
-    tape = Tape(None, ca.cse(ca.vertcat(*(row.expression for row in rows))).elements())
-    still = {i for i, symbol in enumerate(tape.symbols) if q.where(symbol) is None}
-    nodes, total, moving = constants_outside(tape, still).nodes, 0.0, []
-    for kind, args, data in nodes:
-        moving.append(data not in still if kind == "input" else any(moving[a] for a in args))
-        series = [a for a in args if moving[a]]
-        total += PRODUCTS.get(kind, 0.0) if len(series) == len(args) or kind == "div" and moving[args[1]] else 0.0
-    return total, len(nodes)
-
-
 class _Rows:
-    """The rows of a reduction along a motion, whose coefficients they give index by index."""
+    """The rows of a reduction along a motion, whose coefficients they give index by index.
+
+    A stage is (rows, columns, pivots): the entries of γ_[k] that some rows give.
+    """
 
     def __init__(self, equations):
         self.r, self.top, self.motion = equations.r, equations.top, _Motion(equations)
-        self.solved, self.groups = solved_for(equations), []
-        self.rows, self.leading = _in_independent(equations, self.solved.get(1)) or (self.r.rows, self.r.leading)
-        for order in sorted({row.order for row in self.rows}):
-            members = [a for a, row in enumerate(self.rows) if row.order == order]
-            self.groups.append(_Group(self.motion, order, members, [self.rows[a].expression for a in members]))
+        self.solved = solved_for(equations)
+        every = range(len(self.r.rows))
+        self.rows, self.leading, self.stages = self.r.rows, self.r.leading, [(every, every, self.r.order)]
+        reduced = in_independent(equations)
+        if reduced:
+            self.rows, self.leading, first = reduced
+            self.stages = [first, self.solved[1]]
+        self.groups = [self._grouped(rows) for rows, _, _ in self.stages]
+
+    def _grouped(self, rows):
+        """Rows by order."""
+        groups = []
+        for order in sorted({self.rows[a].order for a in rows}):
+            members = [a for a in rows if self.rows[a].order == order]
+            groups.append(_Group(self.motion, order, members, [self.rows[a].expression for a in members]))
+        return groups
 
     def advance(self, k):
         """γ_[k]: below s̄ from the state and the rows that determine a part of it, from s̄ on from all rows."""
-        every = range(len(self.rows))
-        rows, columns, order = self.solved.get(k, ([], [], ())) if k < self.top else (every, every, ())
-        groups, right = [group for group in self.groups if group.order <= k], {}
+        stages = self.stages if k >= self.top else self._below(k)
         if k:
-            self.motion.guess(k, columns)
-        for group in groups:
-            scale = -factorial(k - group.order) / factorial(k)
-            right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
-        if len(rows):
-            solution = self._solution((list(rows), list(columns)), order, ca.vertcat(*(right[a] for a in rows)))
-            gamma = list(self.motion.gamma[k])
-            for i, x in zip(columns, solution.elements(), strict=True):
-                gamma[i] = 0.0 if x.is_zero() else x
-            self.motion.settle(k, gamma)
+            self.motion.guess(k, [j for _, columns, _ in stages for j in columns])
+        for groups, (rows, columns, order) in zip(self.groups, stages, strict=True):
+            groups, right = [group for group in groups if group.order <= k], {}
             for group in groups:
-                group.correct(k)
+                scale = -factorial(k - group.order) / factorial(k)
+                right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+            if len(rows):
+                self._settle(k, columns, self._solution(rows, columns, order, right))
+                for group in groups:
+                    group.correct(k)
 
-    def _solution(self, place, order, right):
-        matrix = self.leading[place[0], place[1]]
-        return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order or self.r.order)[0]
+    def _below(self, k):
+        """The stages of index k < s̄."""
+        rows, columns, order = self.solved.get(k, ([], [], ()))
+        return [(rows, columns, order)] if len(self.stages) == 1 else [([], [], ()), (rows, columns, order)]
+
+    def _settle(self, k, columns, solution):
+        gamma = list(self.motion.gamma[k])
+        for i, x in zip(columns, solution.elements(), strict=True):
+            gamma[i] = 0.0 if x.is_zero() else x
+        self.motion.settle(k, gamma)
+
+    def _solution(self, rows, columns, order, right):
+        matrix = self.leading[list(rows), list(columns)]
+        right = ca.vertcat(*(right[a] for a in rows))
+        return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
 
     def by_rows(self, outputs):
         """Outputs with the velocities that rows determine in place of those of the state, which need not meet the rows.
@@ -512,20 +448,18 @@ class TaylorSteps(Stepping):
         if not plain or any(what is not None for what in watched):
             return False
         p, net = np.append(model.parameters, (t0 + t1) / 2), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT))
-        whole = self.f.whole((t0, x0, t1), p, self.tolerances, self.most, t_eval, net)
+        judged = resolved(*self.tolerances)
+        whole = self.f.whole((t0, x0, t1), p, self.tolerances, self.most, t_eval, net, judged)
         if whole is None or whole[0] == self.most:
             return False
-        steps, jets, (farthest, longest, states, residuals, least, most, first, drifted) = whole
+        steps, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
         if "settled" not in self.f.others:
             top = self.rates.grid(t_eval, jets[: self.n_x], model.parameters)[self.n_x - self.n : self.n_x]
             farthest = np.maximum(farthest, np.abs(top - jets[-self.n :]).max(axis=1, initial=0.0))
             jets[-self.n :] = top
-        if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(jets).all():
+        if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(farthest).all():
             return False
-        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any():
-            return False
-        slopes, tolerance = first[len(residuals) :].reshape(self.n_x, -1).T, Tolerance(model, *self.tolerances)
-        if not (residuals <= LEAVES * tolerance.of(slopes[:, :, None], x0[:, None])[:, 0]).all():
+        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any() or not (residuals <= LEAVES).all():
             return False
         self.motion.fill(model, t_eval, jets)
         self.motion.largest, self.motion.drifted = states, float(drifted[0])

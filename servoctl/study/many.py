@@ -144,7 +144,7 @@ def _share_computed(part, span, method, times):
 
 def _case_table(model, starts, parameters):
     """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
-    columns = {} if parameters is None else as_columns(parameters)
+    columns = {} if parameters is None or isinstance(parameters, dict) and not parameters else as_columns(parameters)
     lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
@@ -258,7 +258,7 @@ class _Many:
         if ends is None:
             return
         good = (ends[:, 0] > 0) & (ends[:, 3] <= OFF)
-        good &= self._tolerances_fit(span, (x0, p), ends[:, -x0.shape[1] :], method)
+        good &= self._tolerances_fit(span, (x0, p), np.ascontiguousarray(ends[:, -x0.shape[1] :].T), method)
         self._take(which, ends, samples, good)
 
     def plans(self, span, times, threads, progress):
@@ -270,7 +270,9 @@ class _Many:
 
     def _take(self, which, ends, samples, good):
         """Take what was computed for some cases, as far as it is good."""
-        here, n_x = which[good], self.final.shape[1]
+        if good.all():  # as slices, which are no copies
+            good = slice(None)
+        here, n_x = which[good] if len(which) < self.n else good, self.final.shape[1]
         self.done[here], self.steps[here] = True, ends[good, 1]
         self.final[here], self.samples[here] = ends[good, len(OF_A_CASE) :][:, :n_x], samples[good]
 
@@ -291,7 +293,7 @@ class _Many:
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
         which = np.flatnonzero(ready)
-        return which, x[which], p[which]
+        return (which, x, p) if len(which) == self.n else (which, x[which], p[which])
 
     def _started(self, t, x, p):
         """Cases (N,) whose states x (N, n_x) follow for all cases at once; these are set."""
@@ -318,15 +320,18 @@ class _Many:
         return affirmed_each(self.model, p.T.copy()) & same_knots
 
     def _tolerances_fit(self, span, cases, largest, method):
-        """Whether motions with magnitudes (N, n_x) need no tolerances of their own, as `simulate` decides it."""
+        """Whether motions with magnitudes (n_x, N) need no tolerances of their own, as `simulate` decides it."""
         default, levels = method.atol is None, state_levels(self.model)
-        fit = (largest.max(axis=1) <= LARGE) | (not default)
-        some = np.flatnonzero(((largest < ATOL / method.rtol) & default).any(axis=1) | unlike(levels, largest.T))
+        fit, doubtful = np.ones(largest.shape[1], bool), unlike(levels, largest)
+        if default:
+            fit = largest.max(axis=0) <= LARGE
+            doubtful |= (largest < ATOL / method.rtol).any(axis=0)
+        some = np.flatnonzero(doubtful)
         if len(some):
             x0, p = (part[some].T for part in cases)
             inertia = self.model.function("matrices").grid(span[0], x0, p)[-self.model.n :]
-            sizes = sizes_of(self.model, inertia, largest[some].T, span[1] - span[0])
-            fit[some] &= ~unlike(levels, largest[some].T, sizes) & ~(coarse(sizes, method.rtol).any(axis=0) & default)
+            sizes = sizes_of(self.model, inertia, largest[:, some], span[1] - span[0])
+            fit[some] &= ~unlike(levels, largest[:, some], sizes) & ~(coarse(sizes, method.rtol).any(axis=0) & default)
         return fit
 
     def one_by_one(self, span, method, times, progress):
@@ -371,7 +376,7 @@ class _Many:
         samples, t = self.samples[finished], _with_end(times, span)
         if len(t) > len(times):
             samples = np.append(samples, self.final[finished, None], axis=1)
-        runs = {i: self.runs[k] for i, k in enumerate(which.tolist()) if k in self.runs}
+        runs = {int(np.searchsorted(which, k)): run for k, run in self.runs.items() if self.done[k]}
         states, p = samples.transpose(2, 1, 0), self.parameters[finished].T
         meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
         trace = Signals(self.model, t, len(times), states, p, level, runs)

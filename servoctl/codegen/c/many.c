@@ -9,7 +9,7 @@
 #define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
 
 typedef struct {
-    W t, x[NX + 1], p[NP + 1], y[NY + 1], atol, h, largest[NX + 1];
+    W t, x[NX + 1], p[NP + 1], work[WORK], y[NY + 1], atol, h, largest[NX + 1];
     W pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
     W violation;    /* the larger one of the start and here */
     W ahead[N + 1]; /* gamma^(s) at the end of the step, by its series */
@@ -168,10 +168,11 @@ void FN(many)(Many *m)
     Motions s = {0};
     int64_t open = 0;
     for (int64_t lane = 0; lane < W_LANES; lane++) open += load(m, lane, &s);
+    expansion_still(s.t, s.x, s.p, s.y, s.work);
     for (int64_t steps = 0; open; steps++) {
         if (stopped(m) || steps == m->most) return;
         judge(&s, s.h == 0);
-        expansion(s.t, s.x, s.p, s.y);
+        expansion_moving(s.t, s.x, s.p, s.y, s.work);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
         W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
         for (int64_t j = 1; j < TOP; j++) {
@@ -211,6 +212,7 @@ void FN(many)(Many *m)
             for (int64_t i = 0; i < NX; i++) x[i][lane] = s.x[i][lane];
             h[lane] = s.steps[lane] = 0;
         }
+        if (w_any(over)) expansion_still(s.t, s.x, s.p, s.y, s.work);
         s.steps += (h != 0) & 1;
         s.h = h;
         for (int64_t i = 0; i < NX; i++) {
