@@ -146,7 +146,6 @@ _OF_ZEROS = {"fmin": "({0} <= {1} || {1} != {1} ? {0} : {1})", "fmax": "({0} >= 
 EXACT = Dialect(forms=_FORMS_OF_ONE | _OF_ZEROS, exact=True)  # of 0 and -0 CasADi takes the first, as C need not
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
 SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True, collected=True)
-LAW = replace(SCALAR_INLINE, chained=True)
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
 EXPORTED = replace(PORTABLE, whole=True)
 WIDE_LANES = Dialect("W", "ALL({})", "w_")
@@ -232,7 +231,7 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
         The same text for the same function, name and loops, in every process.
     """
     dialect = SCALAR_INLINE if INLINE_SINES.intersection(loops) else SCALAR
-    dialect = SCALAR_CHAINED if "closed" in loops else LAW if "law" in loops else dialect
+    dialect = SCALAR_CHAINED if "closed" in loops else dialect
     scalar = {name: f} | ({} if project is None else {f"{name}_project": project})
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
     step = f.numel_in(1) if "newton" in loops else 0
