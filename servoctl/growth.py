@@ -10,7 +10,7 @@ the bases. The products of all Y are the propagators Φ(t, s). Real parts of the
 nothing: where J changes, x' = J x may grow though all of them are negative, and decay though some are positive.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +26,7 @@ from servoctl.model.model import Model
 from servoctl.model.switching import switching
 from servoctl.run import SAME_TIME, Run, require_model
 from servoctl.tolerances import TINY
+from servoctl.values import frozen
 
 AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
 UNSTABLE = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
@@ -56,7 +57,7 @@ PERIODIC = 1e-3  # of the largest linearisation: its change over a period that i
 NEAR_ONE = 1e-3  # of a multiplier: within this of 1 it is neutral
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class InternalDynamics(Shown):
     """How errors in the internal dynamics of a program grow along a motion; made by `internal_dynamics`.
 
@@ -337,7 +338,7 @@ def _largest_integral(t, mu):
     return (along - np.minimum.accumulate(along)).max()
 
 
-@dataclass(frozen=True)
+@frozen
 class Tangents:
     """Names of the states (n_x,), instants (K,), and sizes of the states along a motion (n_x,).
 

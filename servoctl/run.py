@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -15,7 +15,7 @@ from servoctl.markup import EXTREMA, Shown, digits
 from servoctl.model.start import State
 from servoctl.model.switching import switching
 from servoctl.units import unit_of
-from servoctl.values import Value, read_only, same
+from servoctl.values import Value, frozen, read_only, same
 
 STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
 AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
@@ -106,7 +106,7 @@ class Sampled(ByName, Shown):
         return archive.dataset(data, {"t": ("t", self.t, {"units": "s"})}, self._attributes())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Run(Sampled, Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 

@@ -8,7 +8,7 @@ eight products. This rounds twice instead of once.
 """
 
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from itertools import chain, count
 
 import casadi as ca
@@ -21,6 +21,7 @@ from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, looku
 from servoctl.jets.branches import apply_code
 from servoctl.jets.lookup import lookup_at, lookups
 from servoctl.jets.pieces import Constant
+from servoctl.values import frozen
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
@@ -67,7 +68,7 @@ _FORMS_OF_ONE = {
 }
 
 
-@dataclass(frozen=True)
+@frozen
 class Dialect:
     """How C writes the numbers and the head of a function.
 

@@ -4,7 +4,6 @@ import ctypes
 import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -14,6 +13,7 @@ from servoctl.codegen.compiler import lanes
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
 from servoctl.control.loop import Arguments
+from servoctl.values import frozen
 
 INLINED = 300  # operations of the plant's rates, up to which they are inlined into each stage, for all vectors in turn
 VECTORS = 2  # in a block: as many chains of dependent operations as registers hold
@@ -23,7 +23,7 @@ PER_THREAD = 16  # tasks, so that threads end at about the same time
 _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Unit:
     """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
@@ -174,7 +174,7 @@ def _rates_of_block(f):
     return text + head + f"    rates_of_several(t, {arguments});\n}}\n"
 
 
-@dataclass(frozen=True)
+@frozen
 class Gathered:
     """Results of a batch of N cases, for n quantities in the order of `Unit.names`.
 

@@ -1,7 +1,7 @@
 """The conditions of a sampled loop: sensors, timing and disturbances."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from servoctl.checks import (
 from servoctl.control.disturbances import sampled
 from servoctl.control.noise import normal
 from servoctl.errors import SpecificationError
+from servoctl.values import frozen
 
 RESOLVED = 0.05  # largest |λ| h: the error of one Runge-Kutta step of order 4 is then 3e-9
 MOST_SUBSTEPS = 1000
@@ -27,7 +28,7 @@ STEP_OPERATIONS = 50  # of an evaluation besides its own: what a step of Runge-K
 WITHIN_STEP = 1e-9  # of a step: disturbances are sampled this far inside its ends, at which they may jump
 
 
-@dataclass(frozen=True)
+@frozen
 class Sensors:
     """Noise and quantisation of the measured states, in this order.
 
@@ -103,7 +104,7 @@ class Sensors:
         return _by_measure(self.quantisation, texts(measures, "The measured states"))
 
 
-@dataclass(frozen=True)
+@frozen
 class Timing:
     """Sampling rate, delay of the commands, and integration steps per sample.
 
@@ -136,7 +137,7 @@ class Timing:
             object.__setattr__(self, "substeps", whole("substeps", self.substeps, least=1, most=MOST_COUNT))
 
 
-@dataclass(frozen=True)
+@frozen
 class Conditions:
     """Sensors, timing and disturbances of a loop: generalised forces or parameters by name, as functions of t [s]."""
 

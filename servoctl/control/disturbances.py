@@ -1,11 +1,10 @@
 """Disturbances: generalised forces as functions of time; random ones have a seed."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError
+from servoctl.values import frozen
 
 __all__ = ["gust", "noise", "step"]
 
@@ -13,7 +12,7 @@ HARMONICS = 64  # of the noise: its values are then normally distributed to a fe
 CHECKED = 9  # instants at which a function's values for an array are compared with those one by one
 
 
-@dataclass(frozen=True)
+@frozen
 class Gust:
     """A constant force between two instants, with edges of half a cosine.
 
@@ -59,7 +58,7 @@ class Gust:
         return np.where(inside, self.size * (1 - np.cos(np.pi * np.minimum(up, down))) / 2, 0.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Step:
     """A constant force from an instant on.
 
@@ -82,7 +81,7 @@ class Step:
         return np.where(np.asarray(t, dtype=float) >= self.at, self.size, 0.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Noise:
     """A stationary random force: harmonics of equal power and random phase up to a frequency.
 

@@ -8,7 +8,6 @@ are decided by numbers, at states about a plan.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -28,6 +27,7 @@ from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
 from servoctl.reduction.realisation import wished
 from servoctl.run import Run
+from servoctl.values import frozen
 
 PLAN_POINTS = 129  # states of the plan at which a choice of rows must be regular
 WEAK = 0.05  # of its largest size along the plan: a smaller determinant is no choice of rows
@@ -39,7 +39,7 @@ MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until
 TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
 
 
-@dataclass(frozen=True)
+@frozen
 class Linearisation:
     """The exact linearisation of a program; made by `linearise`.
 

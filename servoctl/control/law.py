@@ -1,7 +1,7 @@
 """Laws: what a controller does at each sample, as frozen values; a law with a controller state is started."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,10 @@ from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import Shown
 from servoctl.run import Run
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Law(Value, Shown):
     """A sampled law u = law(t, measurement); made by `feedforward`, `pd`, `lqr` and others.
 
@@ -295,7 +295,7 @@ class Controller:
         return f"Controller of {self.law.name}: state {np.array2string(self.state, precision=4, threshold=8)}"
 
 
-@dataclass(frozen=True)
+@frozen
 class UserStep:
     """A user's function law(t, measurement) -> inputs, or an object whose method `start` returns one, as step of a law.
 

@@ -1,7 +1,7 @@
 """Laws under limits: a small quadratic program per sample decides the inputs, and which residual gives way."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from math import prod
 from types import SimpleNamespace
@@ -28,7 +28,7 @@ from servoctl.jets.branches import cse
 from servoctl.markup import Shown
 from servoctl.plants.plant import Plant
 from servoctl.tolerances import TINY
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 HORIZON = 0.5  # s
 FALLING = 1e-4  # ratio of weights from one residual to the next by priority
@@ -304,7 +304,7 @@ def _metric(reference, names, weights, at_once):
     return H
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Allocation(Value):
     """The step of a limited law: (t, [y; z; last u], [column; numbers; x_ref; D; H]) -> [u; z+; u; signals].
 
@@ -486,7 +486,7 @@ def _sizes(plan, plant, H):
     return np.maximum(sizes, (IDLE * np.max(sizes / unit) or 1.0) * unit)
 
 
-@dataclass(frozen=True)
+@frozen
 class LimitReport(Shown):
     """The residuals that gave way in a closed loop; made by `limit_report`.
 

@@ -3,13 +3,12 @@
 import ctypes
 import enum
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from servoctl.codegen.native import address
 from servoctl.errors import ServoError
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 FINISHED, STATE_LOST, LAW_LOST, INTERRUPTED, PAUSED = enum.IntEnum(
     "Ending", "FINISHED STATE_LOST LAW_LOST INTERRUPTED PAUSED", start=0
@@ -18,7 +17,7 @@ PIECE = 0.03  # s that the compiled loop runs before it looks for Ctrl-C
 FIRST_PIECE = 1000  # integration steps: at most some hundredths of a second
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Loop(Value):
     """The numbers of a closed loop; arrays that are not used are None."""
 

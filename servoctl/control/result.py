@@ -2,7 +2,7 @@
 
 import pickle
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from functools import cached_property
 
 import numpy as np
@@ -17,12 +17,12 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import digits
 from servoctl.plants.plant import Plant
 from servoctl.run import Run, Sampled
-from servoctl.values import Value, read_only
+from servoctl.values import Value, frozen, read_only
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Closed(Sampled, Value):
     """The motion of a plant under a law; made by `close`.
 

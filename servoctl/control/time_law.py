@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.paths import rest_to_rest
 from servoctl.spec.program import Program
+from servoctl.values import frozen
 
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
 BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
@@ -34,7 +34,7 @@ SHORT = 1e-6  # of the span: intervals of samples that are too short for a diffe
 REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class TimeLaw:
     """A program whose time is stretched evenly, or runs by an optimal law, up to a limit; made by `fastest`.
 
@@ -192,7 +192,7 @@ def _optimal(scene, bar):
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class _Scene:
     """A program, its span and start, and the limits of its signals."""
 

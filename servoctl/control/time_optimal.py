@@ -10,7 +10,6 @@ Entries of the state that the rows leave free, the internal dynamics, are colloc
 """
 
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 from math import comb, factorial
 
@@ -22,6 +21,7 @@ from servoctl.errors import IntegrationStopped, SpecificationError, unknown
 from servoctl.methods.radau import radau
 from servoctl.model.model import derived
 from servoctl.spec.paths import piecewise
+from servoctl.values import frozen
 
 JETS = 14  # s, s', ..., among which are those that the rows contain
 INTERVALS = 80
@@ -221,7 +221,7 @@ class Inverse:
         raise unknown(name, [*model.jet_names, *model.signal_groups], "signal")
 
 
-@dataclass(frozen=True)
+@frozen
 class Law:
     """A law s(t): s^(k) at the ends of N equal intervals of a duration, between which it is linear.
 

@@ -3,7 +3,7 @@
 import re
 import textwrap
 import unicodedata
-from dataclasses import dataclass, field
+from dataclasses import field
 from importlib import resources
 
 import casadi as ca
@@ -13,6 +13,7 @@ from servoctl import archive
 from servoctl.codegen import emit
 from servoctl.codegen.loops import source
 from servoctl.units import unit_of
+from servoctl.values import frozen
 
 WIDTH = 110  # longest line of a file
 FUNCTIONS = (  # of math.h, which has each for floats with the suffix f
@@ -22,7 +23,7 @@ FUNCTIONS = (  # of math.h, which has each for floats with the suffix f
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
-@dataclass(frozen=True)
+@frozen
 class Array:
     """An array of the interface, with an enum of its indices.
 
@@ -56,7 +57,7 @@ class Array:
         return Argument(self, name or self.key, "double")
 
 
-@dataclass(frozen=True)
+@frozen
 class Argument:
     """An array as a named argument of a C function."""
 
@@ -70,7 +71,7 @@ class Argument:
         return f"{self.kind} {places}"
 
 
-@dataclass(frozen=True)
+@frozen
 class Scalar:
     """A number as an argument of a C function."""
 
@@ -81,7 +82,7 @@ class Scalar:
         return f"double {self.name}"
 
 
-@dataclass(frozen=True)
+@frozen
 class Constant:
     """Numbers written into the C file.
 
@@ -117,7 +118,7 @@ class Constant:
         return f"{{\n{lines}}}" if np.ndim(self.values) else literals[0]
 
 
-@dataclass(frozen=True)
+@frozen
 class Routine:
     """A public C function, which calls the static function of the same name.
 
@@ -147,7 +148,7 @@ class Routine:
         return f"\n{self.declaration(prefix)}\n{{\n    {'return ' if self.result == 'int' else ''}{call}\n}}\n"
 
 
-@dataclass(frozen=True)
+@frozen
 class Contents:
     """Contents of a C file and its header.
 

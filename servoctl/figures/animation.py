@@ -5,7 +5,7 @@ import io
 import math
 import shutil
 import subprocess
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from servoctl.figures.names import planes_of
 from servoctl.figures.page_motion import moving_drawing
 from servoctl.run import Run
 from servoctl.spec.shapes import heights, moved
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 MOST_FRAMES = 500  # of an animation: longer motions are shown faster
 PATH_POINTS = 400  # of a drawn path
@@ -35,7 +35,7 @@ GREY, LINE, BODY, POINT = "#9A9A9A", "#404040", style.COLOURS[0], style.COLOURS[
 SUFFIXES = (".gif", ".html", ".mp4")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Animation(Value):
     """A mechanism in motion; made by `animate`. A notebook shows it.
 

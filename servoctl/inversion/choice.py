@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -40,6 +40,7 @@ from servoctl.run import Run
 from servoctl.simulation import as_state, simulate
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
+from servoctl.values import frozen
 
 RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
 END_MOVES = "; its end is open, as the program moves there"
@@ -129,7 +130,7 @@ def inverse(
     return _measured(request.run(model, begin, found, chosen), program, found.dynamics)
 
 
-@dataclass(frozen=True)
+@frozen
 class Request:
     """What `inverse` received; `ranges` are limits and bounds, {signal: (low, high)} each."""
 

@@ -12,7 +12,7 @@ the ends of the motion. Extrema between the nodes that exceed a limit become nod
 import functools
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import casadi as ca
 import numpy as np
@@ -30,6 +30,7 @@ from servoctl.progress import progress_bar
 from servoctl.run import Run
 from servoctl.sensitivities.sensitivity import sensitivity
 from servoctl.simulation import judged, simulated
+from servoctl.values import frozen
 from servoctl.verification import Verification, verify
 
 MINIMISED = ("rms", "peak", "time")
@@ -47,7 +48,7 @@ ACTIVE = 1e-5  # distance from an inequality, relative to the limit, within whic
 STATIONARY = 1e-4  # of the cost: largest first-order gain across the ranges at a local minimum
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Design(Shown):
     """Parameters of least actuation or time, and the motion with them; made by `design`.
 
@@ -359,7 +360,7 @@ def _rate_row(model, name, jets, grids):
     return grids[kind, order][model.signals(kind)[0].index(name if order else f"d{name}")]
 
 
-@dataclass(frozen=True)
+@frozen
 class Nodes:
     """Instants t0 + part (t1 - t0) + offset of motions, each (N,), in order for the first one."""
 
@@ -379,7 +380,7 @@ class Nodes:
         return Nodes(part[order], offset[order])
 
 
-@dataclass(frozen=True)
+@frozen
 class Evaluated:
     """Signals at nodes (s, N), their derivatives (s, N, k) there, mean squares (s,), and their derivatives (s, k)."""
 

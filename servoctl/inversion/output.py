@@ -5,7 +5,7 @@ range ends where a root crosses the imaginary axis, or where one passes through 
 equilibrium changes. Where the dimension falls in motion, too, the output is flat.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import casadi as ca
 import numpy as np
@@ -23,6 +23,7 @@ from servoctl.methods.kinks import SMOOTHER, kink
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.simulation import simulate
+from servoctl.values import frozen
 
 VALUES = 257  # of the parameter, spread over its range, at which roots are computed
 TOUCHES = 1e-9  # of its largest value: a coefficient whose smallest value is below has a root there
@@ -32,7 +33,7 @@ CURVE_STEP, CURVE_STEPS = 0.02, 500  # along the rests of a program, relative to
 SHOWN_RANGES, SHOWN_VALUES = 6, 3  # in the printed form
 
 
-@dataclass(frozen=True)
+@frozen
 class Range:
     """Values of a parameter with one kind of internal dynamics.
 
@@ -58,7 +59,7 @@ class Range:
         return f"{self.verdict}, {_states(self.states)}{growing}"
 
 
-@dataclass(frozen=True)
+@frozen
 class Critical:
     """A value of a parameter at which the relative degree at the equilibrium rises.
 
@@ -85,7 +86,7 @@ class Critical:
         return f"the relative degree at the equilibrium rises; {_states(self.states)} there{motion}"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class MinimumPhase:
     """Internal dynamics at an equilibrium over the values of a parameter; made by `minimum_phase`.
 

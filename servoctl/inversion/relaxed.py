@@ -9,7 +9,7 @@ from the solution before, on a mesh that is refined until its motion is that of 
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -44,6 +44,7 @@ from servoctl.run import Run
 from servoctl.spec.paths import piecewise
 from servoctl.spec.program import Program
 from servoctl.study.table import Study, machine
+from servoctl.values import frozen
 
 ORDER = 9  # of the collocation: five nodes
 INTERVALS = 24  # of the first mesh at least
@@ -172,7 +173,7 @@ def _all_limits(plant, limits):
     return magnitudes, rates
 
 
-@dataclass(frozen=True)
+@frozen
 class Plan:
     """A solution: states (n_x, 1 + N s), control points of the inputs (m, 1 + P s), and counts of the iterations."""
 

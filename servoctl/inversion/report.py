@@ -1,7 +1,7 @@
 """What a program asks of its mechanism, in one value: orders, ranks, directions, what is left free, the actuation."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,12 +20,13 @@ from servoctl.run import Run, require_model
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.units import rate_unit
+from servoctl.values import frozen
 
 MOST_LINES = 12  # of a printed report
 FEWEST_OF_A_SPLINE = 4  # samples between two knots through which a spline of order 3 is laid
 
 
-@dataclass(frozen=True)
+@frozen
 class Effort:
     """What one actuator, or one component of an ideal reaction, does along a run.
 
@@ -64,7 +65,7 @@ class Effort:
         return text
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Report(Shown):
     """What a program asks of its mechanism, and which inverse it has; made by `report`.
 

@@ -5,7 +5,6 @@ satisfy x' = f(t, x, u). Inputs are continuous; on an interval they are polynomi
 form: they stay within the hull of their control points, so that limits of these points hold at all instants.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 from math import comb
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
+from servoctl.values import frozen
 
 WATCHED = 12  # instants of bounds in an interval of the inputs
 PIVOTS = 0.1  # threshold of MUMPS: with smaller ones rounding hides the inertia of stiff machines
@@ -92,7 +92,7 @@ class Node:
         return ca.Function(name, [self.q.t, self.state, self.v], outputs, {"der_options": {"cse": True}})
 
 
-@dataclass(frozen=True)
+@frozen
 class Mesh:
     """Intervals and the nodes in them.
 

@@ -1,7 +1,6 @@
 """What a relaxed plan joins: states and inputs at both ends, and a motion between them, where the iteration begins."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -16,13 +15,14 @@ from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.driven import at_once
 from servoctl.simulation import simulated
+from servoctl.values import frozen
 
 EXCEEDED = 1e-6  # of a bound: excess between its instants that a run reports, and at the ends that is refused
 GUESS = 241  # instants of the guess
 STANDING = 1e-6  # rate of a program that stands still, relative to its largest
 
 
-@dataclass(frozen=True)
+@frozen
 class Near:
     """A start in motion whose unstable modes are open, so that the plan begins on its bounded motion.
 

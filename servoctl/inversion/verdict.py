@@ -4,7 +4,7 @@ At rest the eigenvalues of the internal dynamics decide; along a motion the grow
 equation does. Where the leading matrix loses its rank at rest, the zeros at infinity are compared with those in motion.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import casadi as ca
 import numpy as np
@@ -18,6 +18,7 @@ from servoctl.model.start import State
 from servoctl.reduction.structure import margins
 from servoctl.run import Run
 from servoctl.tolerances import NOISE
+from servoctl.values import frozen
 
 FLAT, MINIMUM, MARGINAL, SINGULAR = "flat", "minimum phase", "marginal", "singular at rest"
 HYPERBOLIC_ZEROS, GROWS = "non-minimum phase (hyperbolic)", "non-minimum phase"
@@ -28,7 +29,7 @@ AT_ZERO = 1e-6  # of the fastest eigenvalue: a smaller one is zero, which roundi
 NEAR = 0.1  # of the sizes of the free entries: distance within which a run begins or ends in an unstable rest
 
 
-@dataclass(frozen=True)
+@frozen
 class Verdict:
     """What a program leaves free, and what becomes of it; made by `verdict`.
 

@@ -1,12 +1,12 @@
 """Constant factors of products: a coefficient of (a x) (b y) takes one product by a b in place of one in each term."""
 
 from copy import copy
-from dataclasses import dataclass
 
 from servoctl.jets.tape import Node
+from servoctl.values import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class _Product:
     """number · constant · node, where `constant` is a node without time derivatives, or None."""
 
@@ -29,7 +29,7 @@ def constants_outside(tape, constants):
     Tape
     """
     result = copy(tape)
-    for cached in ("plan", "growing"):
+    for cached in ("plan", "growing", "_plans"):
         result.__dict__.pop(cached, None)
     rewritten = _Rewritten(tape, constants)
     result.nodes, result.outputs = rewritten.nodes, [rewritten.node(i) for i in tape.outputs]

@@ -80,7 +80,7 @@ def select(condition, yes, no):
 
 
 def holds(a):
-    """Whether an SX condition, as 1 or 0, or entries of an array differ from zero; a comparison is 1 or 0 itself."""
+    """Whether an SX condition (as 1 or 0; a comparison is that itself) or the entries of an array differ from zero."""
     return a if isinstance(a, ca.SX) and a.op() in _TRUTHS else a != 0
 
 
@@ -161,6 +161,20 @@ class Tape:
     def plan(self):
         """How the tape is run on numbers."""
         return Plan(self.nodes)
+
+    @cached_property
+    def _plans(self):
+        return {}
+
+    def plan_of(self, first):
+        """The `Plan` of what computes the first outputs, so many or all, and `growing` at its places, (n, 1) array."""
+        if first not in self._plans:
+            count = len(self.nodes) if first is None else self.needed(first)
+            plan = self.plan if first is None else Plan(self.nodes[:count])
+            growing = np.empty((count, 1), dtype=bool)
+            growing[plan.place, 0] = self.growing[:count]
+            self._plans[first] = plan, growing
+        return self._plans[first]
 
     def needed(self, first):
         """The number of leading nodes that compute the first outputs, so many of them."""
@@ -376,6 +390,26 @@ class Plan:
             if kind == "quad":
                 slopes = zip(*(nodes[i].data[1] for i in order[first:last]), strict=True)
                 self.slopes[first] = [self._places(column) for column in slopes]
+
+    @cached_property
+    def grouped(self):
+        """Groups as nodes, and their places: nodes of kind "gather" collect operands from places of all groups."""
+        nodes, places, quadratures = [], [], []
+
+        def gather(some):
+            nodes.append(Node("gather"))
+            places.append(some)
+            return len(nodes) - 1
+
+        for kind, data, here, operands in self.groups:
+            args = tuple(map(gather, operands))
+            quadratures += [len(nodes)] if kind == "quad" else []
+            nodes.append(Node(kind, args, data))
+            places.append(here)
+        for i in quadratures:  # slopes may be operations that follow
+            slopes = tuple(map(gather, self.slopes[places[i].start]))
+            nodes[i] = nodes[i]._replace(data=(nodes[i].data, slopes))
+        return nodes, places
 
     def _places(self, nodes):
         return self.place[np.asarray(nodes, dtype=int)]

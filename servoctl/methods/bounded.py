@@ -8,7 +8,6 @@ Paden 1996; Chen 1993). Collocation at the nodes of Radau IIA of order 13 turns 
 Newton iteration with exact Jacobians; a mesh is refined until the defect between the nodes is below the tolerance.
 """
 
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
@@ -29,6 +28,7 @@ from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin
 from servoctl.methods.radau import basis, radau
 from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE, TINY
+from servoctl.values import frozen
 
 ORDER = 13  # of the collocation: seven nodes
 LONGEST = 4.0  # interval of the first mesh at corners, in time constants of the fastest mode
@@ -149,7 +149,7 @@ def _to_event(problem, events, solution, times):
     return (times, "") if found is None else (np.append(times[times < found.t], found.t), found.name)
 
 
-@dataclass(frozen=True)
+@frozen
 class End:
     """An equilibrium: instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,)."""
 

@@ -7,7 +7,7 @@ that instant, so that its stages see what it stepped over.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import FINER, RESOLUTION, End, net, steps_of
+from servoctl.values import frozen
 
 OFF = 1e3  # times the tolerance, which the equations may add to a step
 REPEATS = 8  # of a step at one instant, after which it is believed
@@ -26,7 +27,7 @@ SHORTEST = 1e-12  # of the span: shorter steps are not repeated, so that a jump 
 SPACING = 1e-3  # of a step, between the points by which its dense output is differentiated
 
 
-@dataclass(frozen=True)
+@frozen
 class Steps:
     """Steps with dense output: states `at(k, times)` (n_x, N) within steps k (N,) at times (N,).
 

@@ -1,6 +1,6 @@
 """What a user passes to `simulate`: methods with their settings, treatments of drift, and which go together."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from servoctl.checks import (
     whole_of,
 )
 from servoctl.errors import SpecificationError, unknown
+from servoctl.values import frozen
 
 ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
 """Order of each Runge-Kutta method: Euler's, the midpoint rule, the classical one of Kutta (1901), Dormand and
@@ -35,7 +36,7 @@ MOVING_CHART = "The integrated coordinates change along the motion, which invali
 # treatments of drift -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@frozen
 class Poles:
     """Error dynamics Π(D - λ_i) ψ = 0 in place of D^ρ ψ = 0 in every row that was differentiated ρ times.
 
@@ -131,7 +132,7 @@ def _conjugate_poles(row, poles):
     return tuple(np.atleast_1d(poles).tolist())
 
 
-@dataclass(frozen=True)
+@frozen
 class Project:
     """Projection onto the invariants: the least change of the jets in the metric M, after every `every`-th step.
 
@@ -154,7 +155,7 @@ class Project:
         return "projected after every step" if self.every == 1 else f"projected after every {self.every} steps"
 
 
-@dataclass(frozen=True)
+@frozen
 class MinimalCoordinates:
     """Integration of as many values as the program leaves free; the others are solved from the constraints."""
 
@@ -213,7 +214,7 @@ class Method:
         return [f.name for f in fields(self) if f.name not in self.named_by]
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class Algebraic(Method):
     """Newton's method at each instant, for programs that determine the motion completely (Σ o_a = 0)."""
 
@@ -223,7 +224,7 @@ class Algebraic(Method):
         return "algebraic"
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class Taylor(Method):
     """Compiled Taylor series steps: the most accurate method, with derivatives of any order.
 
@@ -253,7 +254,7 @@ class Taylor(Method):
         self._check(order=range(2, MOST_JETS + 1), jets=range(1, MOST_JETS + 1))
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class RungeKutta(Method):
     """Compiled explicit Runge-Kutta steps of fixed length; the short forms are "RK1" to "RK8".
 
@@ -278,7 +279,7 @@ class RungeKutta(Method):
         return f"RK{self.order}"
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class Bounded(Method):
     """The bounded motion of unstable internal dynamics, from rest to rest: stable inversion by collocation.
 
@@ -309,7 +310,7 @@ class Bounded(Method):
         return "bounded"
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class RadauIIA(Method):
     """Compiled implicit steps, for stiff motions.
 
@@ -334,7 +335,7 @@ class RadauIIA(Method):
         self._check(order=RADAU_ORDERS)
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class Adaptive(Method):
     """One of scipy's adaptive methods on compiled right-hand sides.
 
@@ -373,7 +374,7 @@ class Adaptive(Method):
         return {Project: PAST_STATES, MinimalCoordinates: MOVING_CHART} if self.name in MULTISTEP else {}
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class Sundials(Method):
     """The multistep methods of SUNDIALS, through CasADi; "IDAS" integrates the rows before elimination.
 
@@ -399,7 +400,7 @@ class Sundials(Method):
         return self.name
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class Automatic(Taylor):
     """The series as a default, in whose place another method takes what does not suit them."""
 

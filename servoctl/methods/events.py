@@ -1,7 +1,6 @@
 """Events: instants at which a signal of a motion crosses a value, located within the steps of its method."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -10,6 +9,7 @@ from servoctl.checks import as_list, finite, mapping, whole
 from servoctl.errors import SpecificationError
 from servoctl.methods.watch import BESIDE_ENDS
 from servoctl.run import Run
+from servoctl.values import frozen
 
 PARTS = 8  # of a step, at whose ends signals are evaluated, beside the samples within it
 TURNS = 0.2  # of a signal's values beside its least one: where a parabola comes below, its minimum is searched for
@@ -17,7 +17,7 @@ AT_START = 1e-9  # of a signal in the first step: a start below it lies on the e
 AT_STOP = 1e-6  # of the motion's duration: an event this close beyond the instant where a motion must stop ends it
 
 
-@dataclass(frozen=True)
+@frozen
 class Event:
     """A signal that crosses a value along a motion.
 
@@ -111,7 +111,7 @@ def _as_event(event):
     return Event(event, 0.0, getattr(event, "terminal", False), getattr(event, "direction", 0.0))
 
 
-@dataclass(frozen=True)
+@frozen
 class Occurrence:
     """The event of a name at t [s], with the jets (n_z,) and the model that holds there."""
 

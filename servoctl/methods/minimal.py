@@ -6,12 +6,12 @@ Pivoted QR chooses them, and chooses again when the choice degrades. Nothing is 
 """
 
 from copy import copy
-from dataclasses import dataclass
 
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
 from servoctl.reduction.ranks import equilibrate
+from servoctl.values import frozen
 
 REACH = 2.0  # speed of the solved values relative to the integrated ones, above which the choice is reconsidered
 BETTER = 2.0  # factor by which another choice must be slower
@@ -330,7 +330,7 @@ class MinimalSolver:
         return Dense(copy(self.chart), self._dense, (*self._before, self.t, self.y))
 
 
-@dataclass(frozen=True)
+@frozen
 class Dense:
     """States within a step from (t0, x0) to (t1, x1), solved from its dense output for the integrated values."""
 

@@ -5,7 +5,7 @@ where only the choice of pivots fails; the equilibrated matrices L and B decide 
 as soon as the matrices are far better than it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from servoctl.methods.sizes import motion_sizes
 from servoctl.model.model import STRONG
 from servoctl.model.report import explain
 from servoctl.tolerances import ENTRY
+from servoctl.values import frozen
 
 DEGRADED = 0.02  # of its reference: a pivot below this is replaced, if the matrix itself is better than that
 HELPS = 5.0  # factor by which the matrix must be better
@@ -31,14 +32,14 @@ NO_CHOICE = "no choice of pivots leads on"
 FRACTIONS = (0.25, 0.5, 0.75)  # of a step with dense output at which pivots are inspected, beside its end
 
 
-@dataclass(frozen=True)
+@frozen
 class Fine:
     """The pivots allow all `steps` steps."""
 
     steps: int
 
 
-@dataclass(frozen=True)
+@frozen
 class Singular:
     """After `steps` whole steps the program is singular at t [s], X = x; `why` is the reason."""
 
@@ -48,7 +49,7 @@ class Singular:
     why: str
 
 
-@dataclass(frozen=True)
+@frozen
 class Repivot:
     """After `steps` whole steps the motion goes on from t [s], X = x with other pivots.
 
@@ -75,7 +76,7 @@ def _other_pivots(steps, t, x):
     return Repivot(steps, t, x, None, Singular(steps, t, x, NO_CHOICE))
 
 
-@dataclass(frozen=True)
+@frozen
 class Stretch:
     """Steps of a method without dense output: between their ends states and pivots are interpolated linearly.
 
@@ -134,7 +135,7 @@ class Stretch:
         return self.t[k]
 
 
-@dataclass(frozen=True)
+@frozen
 class DenseStretch(Stretch):
     """Steps of a method with dense output.
 

@@ -13,6 +13,7 @@ from servoctl.methods.choice import MinimalCoordinates, Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
+from servoctl.values import frozen
 
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
@@ -171,7 +172,7 @@ def equal_steps(a, b, step):
     return (b - a) / count, count
 
 
-@dataclass(frozen=True)
+@frozen
 class Cubics:
     """A motion through states x (n_x, S + 1) with rates (n_x, S + 1) at times t (S + 1,), by Hermite's polynomials."""
 

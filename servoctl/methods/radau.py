@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +12,7 @@ from servoctl.errors import SpecificationError
 from servoctl.methods.bulk import BulkSteps, Steps
 from servoctl.methods.choice import RADAU_ORDERS, Project
 from servoctl.methods.motion import equal_steps
+from servoctl.values import frozen
 
 LEAST_RTOL = {5: 1e-4, 9: 1e-7}  # rtol above which an order needs less work than the next
 NEWTON_TOLERANCE = 1e-2  # of the Newton iteration, relative to the tolerance of a step
@@ -93,7 +93,7 @@ def radau_loop(model, poles=False):
     return model.once("RadauIIA with poles" if poles else "RadauIIA", build)
 
 
-@dataclass(frozen=True)
+@frozen
 class Settings:
     """How Radau IIA steps are taken.
 
@@ -210,7 +210,7 @@ def _size(v):
     return float(np.sqrt(np.mean(np.square(v)))) if v.size else 0.0
 
 
-@dataclass(frozen=True)
+@frozen
 class Collocated(Steps):
     """Steps of a Radau IIA method.
 

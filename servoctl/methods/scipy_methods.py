@@ -1,20 +1,19 @@
 """scipy's adaptive methods on compiled right-hand sides, with projection after their steps."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from servoctl.methods.bulk import BulkSteps, Steps, differentiated
 from servoctl.methods.choice import MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
 from servoctl.methods.watch import edge
+from servoctl.values import frozen
 
 IMPLICIT = ("Radau", "BDF")
 AT_ONCE = 16  # steps that are inspected together, at most: twice as many each time
 MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
 
 
-@dataclass(frozen=True)
+@frozen
 class Solved(Steps):
     """Steps of a solver.
 

@@ -7,7 +7,6 @@ import contextlib
 import io
 import signal
 import threading
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -15,6 +14,7 @@ import numpy as np
 from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.choice import Poles
 from servoctl.methods.motion import Cubics
+from servoctl.values import frozen
 
 WATCHED = 1000  # intervals of a span at whose ends pivots are inspected, beside the samples
 SLACK = 0.5  # times the change of the rates over an interval, by which its cubic may miss them
@@ -153,7 +153,7 @@ def sundials_solver(model, solver, poles=False):
     return model.once(key, lambda: Sundials(model.equations, solver, poles))
 
 
-@dataclass(frozen=True)
+@frozen
 class Grid(Cubics):
     """A motion on a grid; `failed` after its end."""
 

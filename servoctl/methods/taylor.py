@@ -6,7 +6,7 @@ motion by one solve with the same L.
 """
 
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from math import factorial, perm
 
@@ -27,6 +27,7 @@ from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps
 from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate
+from servoctl.values import frozen
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
@@ -657,7 +658,7 @@ class TaylorSteps(Stepping):
         return pending[~due]
 
 
-@dataclass(frozen=True)
+@frozen
 class _Log:
     """Steps of the method with the series at their starts, as `Compiled.taylor` returns them."""
 

@@ -5,7 +5,6 @@ residual and its derivatives change as they extrapolate each other, since the la
 adds to that is its error. Where the program ends (an angle whose sine passes 1) or jumps, this is no small number.
 """
 
-from dataclasses import dataclass
 from math import factorial
 
 import casadi as ca
@@ -16,6 +15,7 @@ from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges, size_of_terms
 from servoctl.methods.sizes import state_levels
 from servoctl.tolerances import TINY
+from servoctl.values import frozen
 
 LEAVES = 1e3  # times its tolerance, which no healthy step adds to a residual
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length, until these are known to be coarser
@@ -39,7 +39,7 @@ MOST_AT_ONCE = 2  # changes of one branch at once, after which the motion stays 
 END_BEFORE = "Let the motion end before, or write the residual so that it is smooth along the motion."
 
 
-@dataclass(frozen=True)
+@frozen
 class End:
     """The smooth piece ends at t [s], X = x, in the step after `steps` whole ones.
 

@@ -5,7 +5,6 @@ begins, its start is that limit.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -16,6 +15,7 @@ from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, c
 from servoctl.progress import stage
 from servoctl.reduction.ranks import equilibrate
 from servoctl.tolerances import RESOLVED
+from servoctl.values import frozen
 
 STANDS = 1e-9  # velocities below this, relative to the coordinates' size, are rest
 MOVES = 1e-5  # velocities above this, likewise, leave six digits of directions that depend on their squares
@@ -25,7 +25,7 @@ NEAR_LIMIT = 1e-2  # rad or m: distance of the first value from the limit up to 
 EQUAL = 1e-9  # difference of values at two instants that is rounding, at velocities of MOVES
 
 
-@dataclass(frozen=True)
+@frozen
 class Standstill:
     """What is open while a machine stands still.
 

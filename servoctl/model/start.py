@@ -1,7 +1,7 @@
 """Consistent starts: held values exact, every invariant satisfied, the rest as near its guess as possible."""
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from math import factorial
 
 import casadi as ca
@@ -12,7 +12,7 @@ from servoctl.errors import InconsistentStart, ServoError, SpecificationError, u
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
 from servoctl.spec.mechanism import require_known
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
 GUESSED = 1e3  # weight of a guessed value relative to one without a guess
@@ -33,7 +33,7 @@ SHOWN = 3  # values by which a printed state tells branches apart
 PRINTED_ZERO = 1e-14  # of the largest value: a smaller one that is not held is printed as zero
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class State(Value, Shown):
     """A consistent state of a model at an instant.
 
@@ -156,7 +156,7 @@ def _numeric(f):
     return lambda *x: f(*x).full().ravel()
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Aim:
     """The state nearest to a reference is sought, by weights, with some values movable; arrays (n_x,)."""
 

@@ -5,7 +5,6 @@ elimination must keep its size, whatever was left out must vanish, and the equat
 as strict as that of `reduction.reduce.holds`, which decides in extended precision where this does not affirm.
 """
 
-from dataclasses import dataclass
 from functools import reduce
 
 import casadi as ca
@@ -18,12 +17,13 @@ from servoctl.reduction.manifold import ON_MANIFOLD, at_usual_size, gradient_sca
 from servoctl.reduction.ranks import clean
 from servoctl.reduction.reduce import HELD, WEAKER, strong
 from servoctl.tolerances import ENTRY, TINY
+from servoctl.values import frozen
 
 TOGETHER = 1000  # sets of parameters, which bounds the memory
 MOVES = 8  # Newton steps of a point to the manifold of other parameters
 
 
-@dataclass(frozen=True)
+@frozen
 class Quantities:
     """What decides whether a derivation is valid, as a function of (t, Z, p).
 

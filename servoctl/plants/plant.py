@@ -1,6 +1,6 @@
 """The plant: the full mechanism with its parameters, friction, actuators and their limits."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 
 import casadi as ca
 import numpy as np
@@ -22,7 +22,7 @@ from servoctl.jets.overflow import settled
 from servoctl.markup import Shown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
 from servoctl.spec.mechanism import Mechanism, require_known
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 
 def plant(
@@ -122,7 +122,7 @@ def part_of(whole, mechanism):
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Plant(Value, Shown):
     """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.
 

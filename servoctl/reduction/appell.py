@@ -4,7 +4,7 @@ The reaction is B μ. With the quasi-coordinates split into dependent ones D and
 A = ∂γ_D/∂γ_I = -B_D⁻ᵀ B_Iᵀ and T = [A; 1] spans ker Bᵀ. For B = Gᵀ the rows of Tᵀ r = 0 are (3.18) as printed.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations, islice
 
 import casadi as ca
@@ -12,13 +12,14 @@ import numpy as np
 
 from servoctl.errors import SpecificationError
 from servoctl.reduction.ranks import clean, decide_all, decide_each, eliminate, equilibrate
+from servoctl.values import frozen
 
 NEGATIVE = 1e-9  # eigenvalues of a scaled inertia matrix below minus this are no rounding errors
 NAMED = 1e-6  # components of a direction below this fraction of the largest are not named in an error
 SPLITS = 100  # choices of dependent coordinates that are tried where the first leads to a contradiction
 
 
-@dataclass(frozen=True)
+@frozen
 class Realisation:
     """Who supplies the reaction B μ, and which quasi-coordinates depend on the others.
 

@@ -8,7 +8,7 @@ in the number of blocks (block triangular forms: Pothen and Fan, ACM TOMS 16 (19
 `servoctl.methods.taylor`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from math import factorial
 
@@ -18,6 +18,7 @@ import numpy as np
 from servoctl.jets.series import Motion, Series, is_zero, shifted
 from servoctl.jets.tape import REAL, Tape, add, divide, multiply
 from servoctl.reduction.ranks import clean, eliminate, pivot_order, solve_clean
+from servoctl.values import frozen
 
 PLACING = 100  # Newton steps to the coordinates of a block, each of at most their size
 PLACED = 1e-17  # relative step at which they are solved
@@ -25,7 +26,7 @@ NEARLY_PLACED = 1e-15  # relative last step of points that count
 TWICE = 2  # least-squares solutions of a level, in which rows are affine: the second takes away rounding
 
 
-@dataclass(frozen=True)
+@frozen
 class Block:
     """Rows, and the coordinates that they determine from jets of those of earlier blocks.
 
@@ -55,7 +56,7 @@ class Block:
         return ca.vertcat(*(row.gradient(q) for row in self.rows))[:, list(self.columns)]
 
 
-@dataclass(frozen=True)
+@frozen
 class Cascade:
     """Blocks in the order in which they are solved.
 

@@ -10,16 +10,17 @@ and a pivot vanishes only where the rank is lost: no coordinates are chosen as d
 choice behind (range-space method: Benzi, Golub and Liesen, Acta Numerica 14 (2005), section 5).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import casadi as ca
 import numpy as np
 
 from servoctl.reduction.appell import NEGATIVE, Realisation
 from servoctl.reduction.ranks import clean, eliminate
+from servoctl.values import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Definite(Realisation):
     """A reaction whose multipliers follow from the definite matrix G M⁻¹B; no coordinate is dependent.
 

@@ -4,7 +4,7 @@ While the leading matrix L of the rows is singular on their manifold, w with w�
 χ = Σ w_a D^(o - o_a) ψ_a of lower order, which replaces one row; the sum of the orders falls at every step.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -25,6 +25,7 @@ from servoctl.reduction.rows import (
     vanishing_gradient,
 )
 from servoctl.tolerances import NOISE, RESOLVED
+from servoctl.values import frozen
 
 DIVIDES = 1e-3  # of its usual size: a combination is not divided by a jet that is smaller at a point
 
@@ -92,7 +93,7 @@ def complete(q, rows, context, starts=None, most=None):
         pivots += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
 
 
-@dataclass(frozen=True)
+@frozen
 class _Combination:
     """A combination of rows whose leading gradients cancel."""
 

@@ -1,7 +1,6 @@
 """Instants at which paths switch, and the smoothness of residuals there, from the expressions themselves."""
 
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from math import factorial
@@ -14,6 +13,7 @@ from servoctl.jets.lookup import Lookup
 from servoctl.jets.pieces import FEWEST, by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
+from servoctl.values import frozen
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants of a scan for switches that are not affine in t
@@ -32,7 +32,7 @@ EXTRA = 4  # additional coefficients for shifting series to the instant itself
 ALONE = 0.5  # s, the neighbourhood of a single switch
 
 
-@dataclass(frozen=True)
+@frozen
 class Knots:
     """Instants at which residuals switch between smooth pieces.
 

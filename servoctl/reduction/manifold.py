@@ -5,7 +5,7 @@ solutions. The Gauss-Newton method solves all levels at once, from seeded random
 are evaluated by numerical Taylor arithmetic in extended precision.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from math import factorial
 
 import casadi as ca
@@ -15,6 +15,7 @@ from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
 from servoctl.tolerances import CUTOFF
+from servoctl.values import frozen
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is a rounding error
 ROUNDED_STEP = 1e-15  # a step from a residual below this is tried once; shortening it gains nothing
@@ -30,7 +31,7 @@ POINTS = 5  # at which ranks are decided; with as many further starts where one 
 POINTS_SEED = 1907  # of the random starts
 
 
-@dataclass(frozen=True)
+@frozen
 class Points:
     """Points in jet space.
 
@@ -386,7 +387,7 @@ def _solved(starting, flow, some, natural=False):
     return points.take(np.flatnonzero(residual < ON_MANIFOLD))
 
 
-@dataclass(frozen=True)
+@frozen
 class Context:
     """Where points are sampled, and with which parameters.
 

@@ -5,7 +5,7 @@ alive: a gear that is blended in at 3 s, a coupling beyond x = 2, a parameter th
 terms of the row, times the size of the jet in which it is the slope, both the largest of the motion so far.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -14,11 +14,12 @@ from servoctl.errors import SingularProgram
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import ON_MANIFOLD, Points, solve
 from servoctl.tolerances import ENTRY
+from servoctl.values import frozen
 
 DRIFTED = 1e-6  # of its terms: below this a slope may be due to drift; above, it is judged on the manifold
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Orders:
     """The slopes on whose vanishing the orders of rows rest; false if there are none.
 

@@ -11,7 +11,6 @@ whose size along a motion shows when the choice has become bad.
 
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -20,6 +19,7 @@ from servoctl.errors import SingularProgram
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import divide, multiply, subtract
 from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
+from servoctl.values import frozen
 
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
 SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
@@ -28,7 +28,7 @@ LARGE, THIN = 40, 0.25  # rows and columns of a matrix, and its share of nonzero
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
 
-@dataclass(frozen=True)
+@frozen
 class Rank:
     """A rank and how clear it is.
 

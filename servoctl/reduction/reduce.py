@@ -1,6 +1,6 @@
 """From a mechanism and a program to the rows that determine the motion and its actuation."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import chain
 
@@ -26,6 +26,7 @@ from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
 from servoctl.tolerances import TINY
+from servoctl.values import frozen
 
 NEARBY = 0.01  # s about an instant for which pivots are chosen; at that instant itself entries may vanish by accident
 NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
@@ -36,7 +37,7 @@ WEAKER = 1e-6  # relative to its size before: a pivot below this with other para
 HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
 
-@dataclass(frozen=True)
+@frozen
 class Reduction(Packed):
     """The rows ψ_a = 0 of a motion, with its hidden constraints, and who realises the program.
 

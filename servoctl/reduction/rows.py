@@ -1,6 +1,6 @@
 """Rows ψ = 0, their orders on the manifold of other rows, and dependences among their leading gradients."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import reduce
 
 import casadi as ca
@@ -13,6 +13,7 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
 from servoctl.tolerances import DEPENDENT, ENTRY
+from servoctl.values import frozen
 
 TAKES_PART = 1e-12  # of the terms of a gradient: a row with a smaller multiple is no part of the combination
 SUPPORTS = 1e-13  # equilibrated coefficient, at any point, above which a row is part of a dependence
@@ -26,7 +27,7 @@ SAME_DEPTH = 20  # nested operations to which factors are compared
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
 
-@dataclass(frozen=True)
+@frozen
 class Balance:
     """The key of the balance r, or of one component of it, beside the names of residuals.
 
@@ -42,7 +43,7 @@ class Balance:
         return f"the force on {self.component}" if self.component else "the balance"
 
 
-@dataclass(frozen=True)
+@frozen
 class Row:
     """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
 

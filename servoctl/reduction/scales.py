@@ -5,10 +5,10 @@ the time T itself are chosen so that log c is as equal as can be within each row
 & Reid, J. Inst. Maths Applics 10 (1972) 118-124, with γ^(k) scaled by s_w / T^k).
 """
 
-from dataclasses import dataclass
-
 import casadi as ca
 import numpy as np
+
+from servoctl.values import frozen
 
 ORDINARY = 100.0  # factor from 1 within which sizes of jets and of the time are taken as 1
 WEAK = 0.3  # weight of the size 1 beside that of a term; a guessed size has the weight of a term
@@ -19,7 +19,7 @@ SCALES_SEED = 1972
 TERM_POINTS = 3  # points at which terms are compared
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Scales:
     """Usual sizes of jets.
 

@@ -5,17 +5,18 @@ balances ψ_2 of order two and their leading matrix L_2. Coriolis terms are quad
 wishes that depend on velocities remain.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
 from servoctl.reduction.ranks import clean, decide_each
+from servoctl.values import frozen
 
 DAMPED = 1e-9  # of the fastest rate of self-motion: slower decay is rounding
 
 
-@dataclass(frozen=True)
+@frozen
 class SelfMotion:
     """Self-motion of a program with open actuation, at rest.
 

@@ -6,7 +6,7 @@ which changes no rank.
 """
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import factorial
 
 import casadi as ca
@@ -19,6 +19,7 @@ from servoctl.reduction.manifold import solve
 from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, solve_clean
 from servoctl.reduction.rows import Row, balances
 from servoctl.tolerances import ENTRY, TINY
+from servoctl.values import frozen
 
 INDEPENDENT = 1e-7  # equilibrated pivots of J above this count
 ACTS = 1e-7  # cosine of an angle between actuators and normals above which it is no right angle
@@ -27,7 +28,7 @@ LEAVES = 1e-6  # change of a state, relative to its size, beyond which no motion
 DEPTHS = (2, 4, 6, 8, 12, 16, 24, 32)  # values of N, tried until J_N shows all zeros at infinity
 
 
-@dataclass(frozen=True)
+@frozen
 class Local:
     """The structure at one point of a motion; attributes as in `Structure`.
 
@@ -62,7 +63,7 @@ class Local:
 UNDECIDED = Local((), 0, (), (), None, 0.0)
 
 
-@dataclass(frozen=True)
+@frozen
 class Structure(Shown):
     """Index and orders of a program realised by actuators (or by an ideal reaction) along a motion.
 
@@ -141,7 +142,7 @@ class Structure(Shown):
         return lines
 
 
-@dataclass(frozen=True)
+@frozen
 class Directions:
     """What the actuators do to the program at one instant, in the inertia metric.
 

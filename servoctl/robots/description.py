@@ -1,7 +1,7 @@
 """A URDF file, read by expat: links, joints and their numbers; document types, and so entities, are refused."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from xml.etree.ElementTree import TreeBuilder
 from xml.parsers import expat
@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
+from servoctl.values import frozen
 
 LARGEST_FILE = 20_000_000  # bytes: a hundred times the largest description of a humanoid
 NEGLIGIBLE = 1e-12  # entry of a rotation that is rounding: zero, or one if it is that near to one
@@ -17,7 +18,7 @@ JOINTS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
-@dataclass(frozen=True)
+@frozen
 class Inertial:
     """Mass [kg], first moment [kg m] and inertia [kg m^2] about the origin of a frame, in its axes: DM or SX."""
 
@@ -38,7 +39,7 @@ class Inertial:
         return Inertial(self.mass, turned + self.mass * offset, ca.triu2symm(ca.triu(inertia)))
 
 
-@dataclass(frozen=True)
+@frozen
 class Joint:
     """A joint: child link on parent link, its placement, axis and the numbers of its tags."""
 
@@ -58,7 +59,7 @@ class Joint:
     mimic: tuple[str, float, float] | None = None  # joint, multiplier, offset
 
 
-@dataclass(frozen=True)
+@frozen
 class Description:
     """Links by name with their inertia, and joints by name in the order of the file."""
 

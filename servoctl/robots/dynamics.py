@@ -1,11 +1,11 @@
 """Kinematics and inertia of a tree of bodies, by recursion over them: linear in their number."""
 
-from dataclasses import dataclass
-
 import casadi as ca
 
+from servoctl.values import frozen
 
-@dataclass(frozen=True)
+
+@frozen
 class Axis:
     """The motion of a joint: coordinates, their rates and accelerations (SX), and what its force works on.
 

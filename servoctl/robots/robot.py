@@ -1,7 +1,6 @@
 """A robot from its file: coordinates named by joints, frames, limits, and the mechanism of its tree of bodies."""
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -15,11 +14,12 @@ from servoctl.robots.inertia import require_possible, with_symbols
 from servoctl.robots.joints import actuator, axes_of, scalars
 from servoctl.robots.tree import ONE_AXIS, tree, with_followers
 from servoctl.spec.mechanism import Mechanism
+from servoctl.values import frozen
 
 UNIT = 1e-6  # largest difference of a quaternion's length from one: numbers of a file or a table with seven digits
 
 
-@dataclass(frozen=True)
+@frozen
 class Frame:
     """A frame of a robot, made by `Robot.frame`.
 

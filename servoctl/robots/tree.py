@@ -1,16 +1,17 @@
 """The tree of moving bodies: links that fixed and locked joints connect are one body, a joint has one axis."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
 from servoctl.robots.description import Inertial, Joint, without_rounding
+from servoctl.values import frozen
 
 ONE_AXIS = ("revolute", "continuous", "prismatic")  # kinds of joints with one position
 
 
-@dataclass(frozen=True)
+@frozen
 class Placement:
     """A frame in the frame of another: rotation (3, 3) and offset (3,) [m], arrays."""
 
@@ -24,7 +25,7 @@ class Placement:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen
 class Body:
     """A moving body: its parent (a position in the tree, or None for the ground), its joint, and its inertia.
 
@@ -46,7 +47,7 @@ class Body:
         return self.joint.mimic if self.joint else None
 
 
-@dataclass(frozen=True)
+@frozen
 class Tree:
     """Bodies, parents first, and the place of each link: (body or None, placement)."""
 

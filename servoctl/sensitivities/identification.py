@@ -7,7 +7,7 @@ the state x its tangents S = ∂x/∂(θ, x_0) are advanced by the same steps, s
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 
 import casadi as ca
@@ -22,7 +22,7 @@ from servoctl.plants.plant import Plant
 from servoctl.run import ByName
 from servoctl.sensitivities.records import as_records
 from servoctl.tolerances import TINY
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 CONVERGES = 1e-10  # of least squares: relative changes of the sum, the unknowns and the gradient
 PRIOR = 1e-3  # weight of relative changes of the parameters, against residuals near 1: it decides what is not seen
@@ -35,7 +35,7 @@ WORSE = 2.0  # misfit of longer pieces relative to that of shorter ones, which a
 MISFIT = 1.25  # times the noise: larger residuals than these say that plant or noise levels are wrong
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Identification(ByName, Value, Shown):
     """Parameters of a plant from measured runs; made by `identify`.
 
@@ -377,7 +377,7 @@ class _Problem:
         return self._kept(f"measurements {' '.join(self.noise)}", build)
 
 
-@dataclass(frozen=True)
+@frozen
 class _Fit:
     """The least-squares solution of a problem; `status` is SciPy's."""
 

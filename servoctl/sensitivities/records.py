@@ -1,7 +1,7 @@
 """Measured runs of a plant: inputs and measurements at equal intervals, checked."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from servoctl.checks import array_of, as_list, as_numbers, numbers_by_name
 from servoctl.control.conditions import steps
 from servoctl.control.result import Closed
 from servoctl.errors import SpecificationError, unknown
+from servoctl.values import frozen
 
 UNEVEN = 1e-3  # of the median interval: samples farther from equal intervals are uneven
 AROUND = 5  # samples to each side, through which a line guesses a velocity that is not measured
@@ -16,7 +17,7 @@ SELDOM = 5.0  # time constants of the plant's fastest eigenvalue, beyond which s
 GAP = 1.5  # median intervals, beyond which samples are missing
 
 
-@dataclass(frozen=True)
+@frozen
 class Record:
     """One measured run, or a piece of it.
 

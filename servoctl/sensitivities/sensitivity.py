@@ -2,7 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_model
 from servoctl.sensitivities.boundary import bounded_tangent
 from servoctl.sensitivities.tangent import along_state, determined, invariants_by, start_of, variational
-from servoctl.values import Value
+from servoctl.values import Value, frozen
 
 RTOL = 1e-11  # of a step of the variational equation
 STIFF = ("Radau", "BDF", "RadauIIA", "CVODES", "IDAS")  # methods of runs whose variational equation is stiff, too
@@ -27,7 +27,7 @@ JUMPS = 1e-6  # of the rates: a larger difference there is a jump
 SHIFT = 1e-4  # of a parameter, by which the instants of knots are differentiated
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Sensitivity(ByName, Value, Shown):
     """Derivatives of signals along a run by parameters and initial values; made by `sensitivity`.
 

@@ -1,14 +1,13 @@
 """The motion that a scene and options on the command line describe."""
 
-from dataclasses import dataclass
-
 from servoctl.checks import as_span
 from servoctl.errors import SpecificationError, unknown
 from servoctl.shell.options import by_name
 from servoctl.shell.scenes import model_of
+from servoctl.values import frozen
 
 
-@dataclass(frozen=True)
+@frozen
 class Scenario:
     """A model with its parameters, a start, and a time span (t0, t1) [s]."""
 

@@ -1,7 +1,7 @@
 """Thousands of closed loops of one plant and one law with different numbers, in one compiled call."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,11 +20,12 @@ from servoctl.plants.equations import equations_at
 from servoctl.reduction.ranks import SUSPECT
 from servoctl.study.cases import CASES, as_cases
 from servoctl.study.table import Study, Traced, machine, table
+from servoctl.values import frozen
 
 SEEDS = 2**31  # seeds of cases are below this
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Batch(Traced):
     """The results of many closed loops; made by `close_many`.
 

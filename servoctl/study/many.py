@@ -4,7 +4,6 @@ import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,12 +26,13 @@ from servoctl.study.cases import FAILURE, as_columns
 from servoctl.study.signals import Signals
 from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
 from servoctl.study.table import Study, Traced, machine, table
+from servoctl.values import frozen
 
 FINAL = "final "  # names of values at the end
 SHARES = 16  # of the cases, which the workers of an executor share
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Motions(Traced):
     """The motions of many cases; made by `simulate_many`.
 
@@ -316,8 +316,10 @@ class _Many:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
-        same_knots = (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
-        return affirmed_each(self.model, p.T.copy()) & same_knots
+        affirmed = affirmed_each(self.model, p.T.copy())
+        if len(of_knots):
+            affirmed &= (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
+        return affirmed
 
     def _tolerances_fit(self, span, cases, largest, method):
         """Whether motions with magnitudes (n_x, N) need no tolerances of their own, as `simulate` decides it."""

@@ -3,7 +3,7 @@
 import inspect
 import time
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from servoctl.simulation import simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.study.tradeoff import CHECKS, Deadline, Reference, method_at, whole_run
+from servoctl.values import frozen
 
 ACCURACIES = (1e-3, 1e-6, 1e-9)  # relative tolerances with which levels are integrated
 FEWEST_ROUNDS, ROUNDS_FOR = 3, 0.1  # rounds of timed calls, one of each row, and s that they take together in a case
@@ -29,7 +30,7 @@ COURSE = 201  # at which the courses of errors in time are compared from case to
 ZERO_SIGNAL = 1e-9  # an output below this part of the largest signal is zero, and its error absolute
 
 
-@dataclass(frozen=True)
+@frozen
 class Level:
     """A model and its plant; `arguments` are the parameters that its function took from a case."""
 

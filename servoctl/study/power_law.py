@@ -1,9 +1,11 @@
 """Errors of modelling at other parameters: a power law through measured ones, and how far it holds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
+
+from servoctl.values import frozen
 
 CONCLUSIVE = 2.0  # factor up to which a prediction counts as conclusive
 FURTHEST = 1.0  # distance outside the measured values, in half-widths of their range of logarithms
@@ -13,7 +15,7 @@ LARGEST_SPREAD = 700.0  # of a spread whose exponential is a double
 MOST_LEVERAGE = 1.0 - 1e-9  # of a case without which the others determine no law
 
 
-@dataclass(frozen=True, repr=False)
+@frozen(repr=False)
 class Prediction:
     """An error at parameters that were not measured; made by `Levels.predict`.
 

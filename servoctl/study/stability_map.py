@@ -7,8 +7,6 @@ dynamics of the drift treatment, whatever the motion: D^ρ ψ = 0 (ρ neutral ei
 function.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from servoctl.checks import named, positives, require_kind
@@ -20,6 +18,7 @@ from servoctl.methods.runge_kutta import ORDERS
 from servoctl.methods.stability import STEP_MAPS, amplification, stability_function
 from servoctl.model.model import Model
 from servoctl.run import Run
+from servoctl.values import frozen
 
 MAPPED = (*ORDERS, "Taylor", "RadauIIA")
 RADAU_ORDER = 5  # default; all orders are L-stable
@@ -28,7 +27,7 @@ GROWTH = 2.0  # growth of errors over the plan that counts as stable: neutral mo
 PER_DECADE, DECADES = 30, 7  # steps tried, below the length of the plan
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class StabilityMap(Shown):
     """The stable steps along a plan; made by `stability`.
 

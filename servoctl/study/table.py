@@ -4,7 +4,7 @@ import functools
 import os
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from importlib import metadata
 
 import numpy as np
@@ -15,12 +15,13 @@ from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
 from servoctl.units import unit_of_column, with_unit
+from servoctl.values import frozen
 from servoctl.version import __version__
 
 SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Study(Shown):
     """A table of results; made by `tradeoff`, `levels`, `stability`, `sweep` or `load_study`.
 
@@ -212,7 +213,7 @@ def machine():
     }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen(eq=False)
 class Traced(Shown):
     """A table with a row per case, and traces of signals at common instants.
 

@@ -1,12 +1,13 @@
 """The motion between samples: integrated from each sample to the next, all at once, by collocation at Gauss points."""
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
+from servoctl.values import frozen
 
 STAGES = 4  # Gauss points of a step: order 8
 FIXED_POINT_STEPS = 25  # of a step, at most: an explicit iteration that takes more needs shorter steps
@@ -26,7 +27,7 @@ def gauss(stages):
     return c, weights / 2, integrals @ np.linalg.inv(c[:, None] ** powers)
 
 
-@dataclass(frozen=True)
+@frozen
 class Flow:
     """The motion of a model as x' = F(t, x): of q for a flat program, else of the state (q, γ', ..., γ^(s̄-1))."""
 
@@ -92,7 +93,7 @@ def _power_of_forces(model):
     return compiled(ca.Function("work", [t, z, p], [ca.densify(f(t, z, p)[1])]), "work")
 
 
-@dataclass(frozen=True)
+@frozen
 class Integration:
     """How intervals are integrated.
 
@@ -114,7 +115,7 @@ class Integration:
     work: np.ndarray
 
 
-@dataclass(frozen=True)
+@frozen
 class Interval:
     """What was found in one or many intervals, one entry for each.
 

@@ -1,10 +1,11 @@
 """The result of a verification: numbers, their limits, and a verdict."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from servoctl.markup import Shown, digits
+from servoctl.values import frozen
 
 PASSED, FAILED, INCONCLUSIVE = "passed", "failed", "inconclusive"
 MOST_LINES = 12  # of a printed verification
@@ -34,7 +35,7 @@ def within(value, limit):
     return "" if limit is None else "within" if value <= limit else "beyond"
 
 
-@dataclass(frozen=True)
+@frozen
 class Verification(Shown):
     """Errors of a run against the full mechanism, all of them relative.
 

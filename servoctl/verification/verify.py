@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from math import factorial
 
@@ -17,6 +17,7 @@ from servoctl.model.store import fingerprint
 from servoctl.model.switching import switching
 from servoctl.progress import stage
 from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
+from servoctl.values import frozen
 from servoctl.verification.between import AGREES, ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.result import Verification, judged, largest, numbers
@@ -189,7 +190,7 @@ def _require_same(model, other):
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class _Instants:
     """Instants at which one variant of the model is evaluated: times (N,), jets (n_z, N) and inputs (m, N).
 
