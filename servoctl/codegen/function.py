@@ -178,10 +178,10 @@ class Compiled:
         """Number of arithmetic operations of one evaluation."""
         return emit.operations(self.expression)
 
-    @functools.cached_property
+    @property
     def interpreted(self):
         """Evaluation by CasADi, whether or not a library is loaded: a few points do not pay for one."""
-        return Interpreter(self.expression)
+        return self._interpreter
 
     @property
     def backend(self):

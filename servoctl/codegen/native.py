@@ -135,6 +135,13 @@ def argument(array):
     return pointer(array)
 
 
+def address(array):
+    """The address of an array's first number, as an int."""
+    if array.size and array.flags.carray:  # by its buffer: a quarter of the time of `array.ctypes`
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    return array.ctypes.data
+
+
 def pointer(array):
     """The address of an array's first number."""
     return ctypes.c_void_p(array.ctypes.data)
