@@ -316,8 +316,10 @@ class _Many:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
-        same_knots = (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
-        return affirmed_each(self.model, p.T.copy()) & same_knots
+        affirmed = affirmed_each(self.model, p.T.copy())
+        if len(of_knots):
+            affirmed &= (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
+        return affirmed
 
     def _tolerances_fit(self, span, cases, largest, method):
         """Whether motions with magnitudes (n_x, N) need no tolerances of their own, as `simulate` decides it."""
