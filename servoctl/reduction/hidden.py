@@ -27,6 +27,7 @@ from servoctl.reduction.rows import (
 from servoctl.tolerances import NOISE, RESOLVED
 from servoctl.values import frozen
 
+OUT_OF_REACH = 30.0  # least value of a residual, relative to its changes, where mixed units are a likely cause
 DIVIDES = 1e-3  # of its usual size: a combination is not divided by a jet that is smaller at a point
 
 
@@ -152,7 +153,7 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), vanishing=vanishing)
     row, points = settle(q, chi, rows[:b] + rows[b + 1 :], context, starts)
     if row is None:
-        raise _no_state(rows[:b] + rows[b + 1 :])
+        raise _no_state(q, rows[:b] + rows[b + 1 :], context)
     return _Combination(replace(row, story=story), b, support, points, pivots, chi)
 
 
@@ -371,23 +372,34 @@ def _no_common_state(q, rows, context):
         ranks = decide_each(clean(numbers, sizes))
         rank, _ = generic(ranks)
         if not rank.clear or rank.rank == len(rows):
-            return _no_state(given)
+            return _no_state(q, given, context)
         same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
         try:
             combination = _lowest(q, rows, numbers[:, :, same], context)
         except InconsistentStart:  # some of the rows alone have no common state
-            return _no_state(given)
+            return _no_state(q, given, context)
         if combination.row.order < 0:
             return _dependent(q, rows, combination, context)
         rows = [combination.row if a == combination.replaces else row for a, row in enumerate(rows)]
 
 
-def _no_state(rows):
+def _no_state(q, rows, context):
+    """The error of rows without a common state; it tells of one that is far from where random points move it."""
+    points = sample(q, [], max(0, *(row.order for row in rows)), context)
+    points = replace(points, t=np.full_like(points.t, points.t[0]))  # a path alone brings no residual to zero
+    values = np.abs(points.evaluate([row.expression for row in rows])[0]).astype(float)
+    with np.errstate(all="ignore"):
+        ratios = np.nan_to_num(values.min(axis=1) / np.ptp(values, axis=1), posinf=0.0)
+    name, ratio = max(zip((row.name for row in rows), ratios.tolist(), strict=True), key=lambda pair: pair[1])
+    far = f"; {name} is {ratio:.0f} times as far from zero as coordinates of usual size change it"
+    far = far if ratio > OUT_OF_REACH else ""
+    units = "Check that lengths have the same unit (m, not mm), pass" if far else "Pass"
     return InconsistentStart(
-        f"No state satisfies {', '.join(sorted({row.name for row in rows}))} and their time derivatives.",
+        f"No state satisfies {', '.join(sorted({row.name for row in rows}))} and their time derivatives{far}.",
         "Newton's method searches for such states about the guess.",
-        do="Pass guess={...} near the motion to derive, or correct the constraints.",
+        do=f"{units} guess={{...}} near the motion to derive, or correct the constraints.",
         rows=[row.name for row in rows],
+        **({"far": name, "ratio": ratio} if far else {}),
     )
 
 
