@@ -1,7 +1,6 @@
 """Files of results: npz archives without pickle, and the errors where one cannot be written or read."""
 
 import contextlib
-import csv
 import json
 from pathlib import Path
 
@@ -52,6 +51,8 @@ def table(path, what, columns, units):
     head = [with_unit(name, units.get(name, "")) for name in columns]
     with writing(path, what) as path:
         with open(path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+            import csv
+
             lines = csv.writer(file, lineterminator="\n")
             lines.writerows([_cell(value) for value in row] for row in (head, *rows))
     return path

@@ -1,7 +1,6 @@
 """Tables in HTML, for notebooks and for the page of a run."""
 
 import re
-from html import escape
 
 EXTREMA = ("signal", "least", "at t [s]", "greatest", "at t [s]", "unit")
 LABEL = re.compile(r"([^;:()=]{1,40}): (.+)")  # a line of a printed value that begins with what it is about
@@ -16,7 +15,7 @@ class Shown:
 
     def _repr_html_(self):
         tables, lines = self._tables()
-        caption = f"<p><b>{escape(repr(self).splitlines()[0])}</b></p>"
+        caption = f"<p><b>{_escaped(repr(self).splitlines()[0])}</b></p>"
         return caption + "".join(rows_of(*table) for table in tables) + (lines_of(lines) if lines else "")
 
 
@@ -35,7 +34,7 @@ def rows_of(head, rows):
     numeric = [all(_is_number(row[i]) for row in rows) for i in range(len(head))]
 
     def line(tag, cells):
-        marked = (f'<{tag}{" class=n" * n}>{escape(c)}</{tag}>' for c, n in zip(cells, numeric, strict=True))
+        marked = (f'<{tag}{" class=n" * n}>{_escaped(c)}</{tag}>' for c, n in zip(cells, numeric, strict=True))
         return f"<tr>{''.join(marked)}</tr>"
 
     return f"<table>{line('th', head)}{''.join(line('td', row) for row in rows)}</table>"
@@ -47,8 +46,8 @@ def lines_of(lines):
     for line in (line.strip() for line in lines):
         label = LABEL.fullmatch(line)
         left = ' style="text-align: left"'
-        cells += [f"<tr><td{left}>{escape(label[1])}</td><td{left}>{escape(label[2])}</td></tr>"] if label else [
-            f'<tr><td colspan="2"{left}>{escape(line)}</td></tr>'
+        cells += [f"<tr><td{left}>{_escaped(label[1])}</td><td{left}>{_escaped(label[2])}</td></tr>"] if label else [
+            f'<tr><td colspan="2"{left}>{_escaped(line)}</td></tr>'
         ]
     return f"<table>{''.join(cells)}</table>"
 
@@ -56,6 +55,12 @@ def lines_of(lines):
 def digits(value, most=6):
     """A number with six digits, or as many as given; a dash where there is none, and no zero with a sign."""
     return "–" if value is None else f"{value + 0.0:.{most}g}"
+
+
+def _escaped(text):
+    from html import escape
+
+    return escape(text)
 
 
 def _is_number(text):

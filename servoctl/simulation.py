@@ -214,13 +214,7 @@ def _sampled(run, times):
 def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, events=None, progress=None):
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
-    drift = as_drift(drift)
-    method = default_method(model, drift) if method is None else as_method(method)
-    require_combination(model, method, drift)
-    if isinstance(drift, Poles):
-        _require_decay(model, drift, t0, t1)
-        if str(method) in EXPLICIT:
-            warn_many_steps(str(method), drift.by_row(model), t1 - t0)
+    method, drift = _method_and_drift(model, method, drift, t0, t1)
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
@@ -255,6 +249,18 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     if run.success and not model.flat and not motion.drifted <= DRIFTED:
         _warn_drifted(run)
     return run
+
+
+def _method_and_drift(model, method, drift, t0, t1):
+    """Method and treatment of drift, which go together over a span [s]."""
+    drift = as_drift(drift)
+    method = default_method(model, drift) if method is None else as_method(method)
+    require_combination(model, method, drift)
+    if isinstance(drift, Poles):
+        _require_decay(model, drift, t0, t1)
+        if str(method) in EXPLICIT:
+            warn_many_steps(str(method), drift.by_row(model), t1 - t0)
+    return method, drift
 
 
 def _interrupted_at_its_end(run):

@@ -15,6 +15,7 @@ import casadi as ca
 
 from servoctl.jets.pieces import Constant, operand_values
 
+PAIRED = 8  # sums among a sum's factors: of more of them no two are multiplied out together, which takes longest
 ADDED = (0, 1, 2)  # terms by which a sum may grow where another is multiplied out: the fastest result is taken
 NOTHING = ((), 0.0)  # the term of a sum without terms
 _DECIDING = {
@@ -175,7 +176,7 @@ class _Collected:
         terms = self.of_one_angle({m: c for m, c in terms.items() if c})
         while True:
             sums = sorted({a for m in terms for a, n in m if n == 1 and a in self.sums})
-            groups = [(a,) for a in sums] + [*itertools.combinations(sums, 2)]
+            groups = [(a,) for a in sums] + [*itertools.combinations(sums, 2)] * (len(sums) <= PAIRED)
             others = (self.multiplied(terms, group) for group in groups)
             best = min((other for other in others if other is not None), key=len, default=terms)
             if best is terms:

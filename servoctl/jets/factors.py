@@ -29,7 +29,7 @@ def constants_outside(tape, constants):
     Tape
     """
     result = copy(tape)
-    for cached in ("plan", "growing"):
+    for cached in ("plan", "growing", "_plans"):
         result.__dict__.pop(cached, None)
     rewritten = _Rewritten(tape, constants)
     result.nodes, result.outputs = rewritten.nodes, [rewritten.node(i) for i in tape.outputs]

@@ -65,8 +65,6 @@ class Series:
         Coefficients of each input; before `advance()` computes coefficient k, at least k + 1 of them.
     decided : dict of int to value, optional
         Values of nodes by which branches are taken. Default: coefficient 0 of the compared nodes.
-    first : int, optional
-        How many of the tape's outputs are computed; default all.
 
     Attributes
     ----------
@@ -76,9 +74,9 @@ class Series:
         Their number.
     """
 
-    def __init__(self, tape, inputs, decided=None, first=None):
+    def __init__(self, tape, inputs, decided=None):
         self.tape = tape
-        self.nodes = tape.nodes if first is None else tape.nodes[: tape.needed(first)]
+        self.nodes = tape.nodes
         self.inputs = inputs
         self.c = [[] for _ in self.nodes]
         self.k = 0
@@ -146,11 +144,15 @@ class Series:
 
         Its quotient vanishes there, to far below the smallest number that matters, and so do all its coefficients.
         """
-        if k == 0 or is_zero(rest) or not self.tape.growing[divisor]:
+        if k == 0 or is_zero(rest) or not self._grows(divisor):
             return rest
         size = apply("fabs", self.c[divisor][0])
         counts = apply("logic_or", apply("lt", size, OVERFLOWING), finite(rest))
         return select(counts, rest, dividend)
+
+    def _grows(self, node):
+        """Whether a node has a function that may overflow among its arguments."""
+        return self.tape.growing[node]
 
     def _deciding(self, node):
         """The value of a node by which branches are taken."""
@@ -201,6 +203,51 @@ class Series:
             terms = ((_times(a[j + 1], float(j + 1)), g[k - 1 - j]) for j in _inner_first(k - 1))
             total = add_to(total, _dot(terms))
         return total if k == 1 or is_zero(total) else over(total, k)
+
+
+class _Grouped(Series):
+    """A tape run on series of numbers at many points, a group of equal operations at a time: (size, N) arrays.
+
+    Parameters
+    ----------
+    tape : Tape
+    inputs : list of list of arrays (N,) or numbers
+        Coefficients of each input.
+    first : int or None
+        How many of the tape's outputs are computed; None for all.
+    n_points : int
+        N.
+    """
+
+    def __init__(self, tape, inputs, first, n_points):
+        self.tape, self.inputs, (self.plan, self.growing) = tape, inputs, tape.plan_of(first)
+        self.nodes, self.places = self.plan.grouped
+        self.shape, self.values = (len(self.plan.place), n_points), []  # coefficients of all operations
+        self.c, self.k, self.decided = [[] for _ in self.nodes], 0, {}
+
+    def advance(self):
+        """Compute the next coefficient of every group."""
+        values = np.zeros(self.shape, dtype=REAL)
+        if self.k == 0:
+            places, constants = self.plan.constants
+            values[places] = np.array(constants)[:, None]
+        for place, i in zip(*self.plan.inputs, strict=True):
+            values[place] = self.inputs[i][self.k]
+        self.values.append(values)
+        for i, (node, places) in enumerate(zip(self.nodes, self.places, strict=True)):
+            if node.kind == "gather":
+                self.c[i].append(values.take(places, axis=0))
+            else:
+                values[places] = coefficient = self._coefficient(node, i, self.k)
+                self.c[i].append(coefficient)
+        self.k += 1
+
+    def _bounded(self, rest, dividend, divisor, k):
+        bounded = super()._bounded(rest, dividend, divisor, k)
+        return rest if bounded is rest else np.where(self.growing[self.places[divisor]], bounded, rest)
+
+    def _grows(self, node):
+        return self.growing[self.places[node]].any()
 
 
 class Motion:
@@ -423,16 +470,11 @@ class Flow:
         for symbol, value in zip(scalars.tape.symbols, values, strict=True):
             higher = (motion.coefficient(symbol, k) for k in range(1, depth + 1))
             inputs.append(self.signals.get(symbol.element_hash()) or [value, *higher])
-        series = Series(scalars.tape, inputs, first=first)
+        series = _Grouped(scalars.tape, inputs, first, z.shape[1])
         with np.errstate(all="ignore"):
             for _ in range(depth + 1):
                 series.advance()
-        outputs = scalars.tape.outputs[:first]
-        result = np.zeros((len(outputs), depth + 1, z.shape[1]), dtype=REAL)
-        for i, node in enumerate(outputs):
-            for k, c in enumerate(series.c[node]):
-                result[i, k] = c
-        return result
+        return np.stack(series.values, axis=1)[series.plan.place[scalars.tape.outputs[:first]]]
 
 
 class _Numbers(Motion):

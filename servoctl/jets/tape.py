@@ -162,6 +162,20 @@ class Tape:
         """How the tape is run on numbers."""
         return Plan(self.nodes)
 
+    @cached_property
+    def _plans(self):
+        return {}
+
+    def plan_of(self, first):
+        """The `Plan` of what computes the first outputs, so many or all, and `growing` at its places, (n, 1) array."""
+        if first not in self._plans:
+            count = len(self.nodes) if first is None else self.needed(first)
+            plan = self.plan if first is None else Plan(self.nodes[:count])
+            growing = np.empty((count, 1), dtype=bool)
+            growing[plan.place, 0] = self.growing[:count]
+            self._plans[first] = plan, growing
+        return self._plans[first]
+
     def needed(self, first):
         """The number of leading nodes that compute the first outputs, so many of them."""
         count = i = 1 + max(self.outputs[:first], default=-1)
@@ -376,6 +390,26 @@ class Plan:
             if kind == "quad":
                 slopes = zip(*(nodes[i].data[1] for i in order[first:last]), strict=True)
                 self.slopes[first] = [self._places(column) for column in slopes]
+
+    @cached_property
+    def grouped(self):
+        """Groups as nodes, and their places: nodes of kind "gather" collect operands from places of all groups."""
+        nodes, places, quadratures = [], [], []
+
+        def gather(some):
+            nodes.append(Node("gather"))
+            places.append(some)
+            return len(nodes) - 1
+
+        for kind, data, here, operands in self.groups:
+            args = tuple(map(gather, operands))
+            quadratures += [len(nodes)] if kind == "quad" else []
+            nodes.append(Node(kind, args, data))
+            places.append(here)
+        for i in quadratures:  # slopes may be operations that follow
+            slopes = tuple(map(gather, self.slopes[places[i].start]))
+            nodes[i] = nodes[i]._replace(data=(nodes[i].data, slopes))
+        return nodes, places
 
     def _places(self, nodes):
         return self.place[np.asarray(nodes, dtype=int)]

@@ -132,8 +132,9 @@ def growth(Z, count, settings):
         ln of the largest growth between instants that are at most 0, 1, ... blocks apart.
     """
     f, n_x, S = Z.shape
-    parts = (f + 2) * n_x * S + n_x * (n_x + 3), (f + 2) * S, (3 * f + 1) * padded(f)
-    work = np.empty(S * (2 * f * n_x + 2 * f**2 + 2 * count) + max(parts))
+    of_vectors = n_x**2 + f * n_x * (f + 1) // 2 + (f + 1) * (n_x + 1)
+    others = 8 + n_x * (n_x + 3) + (3 * f + 1) * padded(f)
+    work = np.empty(2 * S * (f * (n_x + f) + count) + 8 * of_vectors + others)
     settings, scale, within = np.array(settings), np.empty(n_x), np.empty(count)
     sizes = map(ctypes.c_int64, (count, n_x, f))
     found = of_any_size("growth", "growth")(*sizes, *map(pointer, (Z, settings, work, scale, within)))

@@ -1,100 +1,110 @@
 /* Whether deviations from a motion with n_x states grow as those of unstable internal dynamics do. */
 #include "unit.h"
 #include "orthonormal.h"
+#include "lanes.h"
 
 /* The constants of growth.py. */
 typedef struct {
     double moderate, sweeps, balanced, tiny, squarings, unstable, exponential, faster, most_growth, great;
 } Settings;
 
-/* An entry of matrices at n instants has S = PADDED(n) numbers, one after the other; those beyond n repeat the last one.
-   Whole vectors are added and multiplied without looking at their number. */
-#define EACH(t) for (int64_t t##8 = 0; t##8 < S; t##8 += 8) for (int64_t t = t##8; t < t##8 + 8; t++)
+/* Matrices at n instants are blocks of matrices of vectors, whose lanes are instants; those beyond n repeat the last one. */
 
-/* Matrices Q (F, n_x) of all instants become Q R^-1 with orthonormal rows, by Gram and Schmidt's process, twice; values
-   that are not finite where rows are dependent. */
-static void all_orthonormal(int64_t S, int64_t F, int64_t n_x, double *restrict Q, double *restrict R)
+/* Rows of Q (F, n_x) become those of R^-T Q, which are orthonormal, by Gram and Schmidt's process, twice; values that are
+   not finite where they are dependent. */
+static void orthonormal_rows(int64_t F, int64_t n_x, W *Q, W *R)
 {
-    double along[S];
-    for (int64_t i = 0; i < F * F * S; i++) R[i] = 0;
+    for (int64_t i = 0; i < F * F; i++) R[i] = ALL(0.0);
     for (int64_t j = 0; j < F; j++) {
-        double *v = Q + j * n_x * S, *size = R + j * (F + 1) * S;
+        W *v = Q + j * n_x, square = ALL(0.0), unit;
         for (int twice = 0; twice < 2; twice++) for (int64_t i = 0; i < j; i++) {
-            const double *other = Q + i * n_x * S;
-            double *r = R + (i * F + j) * S;
-            EACH(t) along[t] = 0;
-            for (int64_t m = 0; m < n_x; m++) EACH(t) along[t] += other[m * S + t] * v[m * S + t];
-            for (int64_t m = 0; m < n_x; m++) EACH(t) v[m * S + t] -= along[t] * other[m * S + t];
-            EACH(t) r[t] += along[t];
+            W along = ALL(0.0);
+            for (int64_t m = 0; m < n_x; m++) along += Q[i * n_x + m] * v[m];
+            for (int64_t m = 0; m < n_x; m++) v[m] -= along * Q[i * n_x + m];
+            R[i * F + j] += along;
         }
-        for (int64_t m = 0; m < n_x; m++) EACH(t) size[t] += v[m * S + t] * v[m * S + t];
-        EACH(t) along[t] = 1 / (size[t] = sqrt(size[t]));
-        for (int64_t m = 0; m < n_x; m++) EACH(t) v[m * S + t] *= along[t];
+        for (int64_t m = 0; m < n_x; m++) square += v[m] * v[m];
+        for (int64_t l = 0; l < W_LANES; l++) R[j * F + j][l] = sqrt(square[l]);
+        unit = 1 / R[j * F + j];
+        for (int64_t m = 0; m < n_x; m++) v[m] *= unit;
     }
 }
 
-/* B = A^-1 of upper triangular matrices (F, F) of all instants. */
-static void all_inverse(int64_t S, int64_t F, const double *restrict A, double *restrict B)
+/* B = A^-1 of upper triangular matrices. */
+static void inverse(int64_t F, const W *A, W *B)
 {
-    for (int64_t i = 0; i < F * F * S; i++) B[i] = 0;
-    for (int64_t j = 0; j < F; j++) for (int64_t i = j; i >= 0; i--) {
-        double *sum = B + (i * F + j) * S;
-        const double *pivot = A + i * (F + 1) * S;
-        EACH(t) sum[t] = i == j;
-        for (int64_t k = i + 1; k <= j; k++) {
-            const double *a = A + (i * F + k) * S, *b = B + (k * F + j) * S;
-            EACH(t) sum[t] -= a[t] * b[t];
-        }
-        EACH(t) sum[t] /= pivot[t];
+    for (int64_t j = 0; j < F; j++) for (int64_t i = F - 1; i >= 0; i--) {
+        W sum = i == j ? ALL(1.0) : ALL(0.0);
+        for (int64_t k = i + 1; k <= j; k++) sum -= A[i * F + k] * B[k * F + j];
+        B[i * F + j] = i > j ? ALL(0.0) : sum / A[i * F + i];
     }
 }
 
 /* Whether the products of entries of matrices with those of their inverses stay below a limit. */
-static int moderate(int64_t count, const double *P, const double *inverses, double limit)
+static int moderate(int64_t count, const W *P, const W *inverses, double limit)
 {
-    double most = 0, most_inverse = 0, sum = 0;
+    W most = ALL(0.0), most_inverse = ALL(0.0), sum = ALL(0.0);
     for (int64_t i = 0; i < count; i++) {
-        most = fabs(P[i]) > most ? fabs(P[i]) : most;
-        most_inverse = fabs(inverses[i]) > most_inverse ? fabs(inverses[i]) : most_inverse;
+        most = w_fmax(most, w_fabs(P[i]));
+        most_inverse = w_fmax(most_inverse, w_fabs(inverses[i]));
         sum += P[i] * 0 + inverses[i] * 0;
     }
-    return sum == 0 && most * most_inverse < limit; /* not if one of them is not finite */
+    double largest = 0, largest_inverse = 0;
+    for (int64_t l = 0; l < W_LANES; l++) {
+        if (sum[l] != 0) return 0; /* one is not finite */
+        largest = fmax(largest, most[l]);
+        largest_inverse = fmax(largest_inverse, most_inverse[l]);
+    }
+    return largest * largest_inverse < limit;
 }
 
-/* The sum of the squares of N(t) Phi(t, s) N(s)' = Z(t) P(s)^-1 Q(s)' over all pairs of instants t >= s, W (n_x, n_x).
-   work has 2 S n_x + F n_x S numbers. */
-static void sum_of_squares(int64_t n, int64_t S, int64_t F, int64_t n_x, const double *Z, const double *Q,
-                           const double *inverses, double *W, double *work)
+/* Sums over the lanes up to each. */
+static inline W sums_up_to(W a)
 {
-    double *restrict before = work, *restrict after = before + S * n_x, *earlier = after + S * n_x;
-    for (int64_t j = 0; j < F; j++) for (int64_t i = 0; i < n_x; i++) {
-        double *restrict sum = earlier + (j * n_x + i) * S;
-        EACH(t) sum[t] = 0;
-        for (int64_t k = j; k < F; k++) {
-            const double *q = Q + (k * n_x + i) * S, *p = inverses + (j * F + k) * S;
-            EACH(t) sum[t] += q[t] * p[t];
+    const W zero = ALL(0.0);
+    for (int64_t apart = 1; apart < W_LANES; apart *= 2) {
+        I from;
+        for (int64_t l = 0; l < W_LANES; l++) from[l] = l < apart ? W_LANES : l - apart;
+        a += __builtin_shuffle(a, zero, from);
+    }
+    return a;
+}
+
+/* The sum of the squares of N(t) Phi(t, s) N(s)' = Z(t) P(s)^-1 Q(s)' over all pairs of instants t >= s, squares (n_x, n_x).
+   work has n_x^2 + F (F + 1) n_x + F n_x vectors. */
+static void sum_of_squares(int64_t n, int64_t F, int64_t n_x, const W *Z, const W *Q, const W *inverses, double *squares,
+                           W *work)
+{
+    W *sums = work, *before = sums + n_x * n_x, *earlier = before + F * (F + 1) / 2 * n_x, *after = earlier + F * n_x;
+    for (int64_t i = 0; i < n_x * n_x + F * (F + 1) / 2 * n_x; i++) sums[i] = ALL(0.0);
+    for (int64_t block = 0; block < PADDED(n); block += W_LANES, Z += F * n_x, Q += F * n_x, inverses += F * F) {
+        W counted, *carried = before;
+        for (int64_t l = 0; l < W_LANES; l++) counted[l] = block + l < n;
+        for (int64_t j = 0; j < F; j++) for (int64_t i = 0; i < n_x; i++) {
+            W sum = ALL(0.0);
+            for (int64_t k = j; k < F; k++) sum += Q[k * n_x + i] * inverses[j * F + k];
+            earlier[j * n_x + i] = sum;
+        }
+        for (int64_t a = 0; a < F; a++) for (int64_t b = a; b < F; b++, carried += n_x) {
+            for (int64_t j = 0; j < n_x; j++) {
+                const W sum = carried[j] + sums_up_to(earlier[a * n_x + j] * earlier[b * n_x + j]);
+                after[j] = sum;
+                carried[j] = ALL(sum[W_LANES - 1]);
+            }
+            for (int64_t i = 0; i < n_x; i++) {
+                const W z = counted * (a == b ? 1.0 : 2.0) * Z[a * n_x + i] * Z[b * n_x + i];
+                for (int64_t j = 0; j < n_x; j++) sums[i * n_x + j] += z * after[j];
+            }
         }
     }
-    for (int64_t i = 0; i < n_x * n_x; i++) W[i] = 0;
-    for (int64_t a = 0; a < F; a++) for (int64_t b = a; b < F; b++) {
-        const double *first = earlier + a * n_x * S, *second = earlier + b * n_x * S;
-        const double *z = Z + a * n_x * S, *other = Z + b * n_x * S, times = a == b ? 1 : 2;
-        for (int64_t i = 0; i < n_x * S; i++) before[i] = first[i] * second[i];
-        for (int64_t i = 0; i < n_x * S; i++) after[i] = times * z[i] * other[i];
-        for (int64_t t = 1; t < n; t++) for (int64_t i = 0; i < n_x; i++) before[i * S + t] += before[i * S + t - 1];
-        for (int64_t i = 0; i < n_x; i++) for (int64_t t = n; t < S; t++) after[i * S + t] = 0;
-        for (int64_t i = 0; i < n_x; i++) for (int64_t j = 0; j < n_x; j++) {
-            double sums[8] = {0};
-            for (int64_t t = 0; t < S; t += 8) {
-                for (int64_t l = 0; l < 8; l++) sums[l] += after[i * S + t + l] * before[j * S + t + l];
-            }
-            for (int64_t l = 0; l < 8; l++) W[i * n_x + j] += sums[l];
-        }
+    for (int64_t i = 0; i < n_x * n_x; i++) {
+        squares[i] = 0;
+        for (int64_t l = 0; l < W_LANES; l++) squares[i] += sums[i][l];
     }
 }
 
-/* d that makes the sum of W_ij d_j^2/d_i^2 smallest, as `_balance` of growth.py; work has 3 n_x numbers. */
-static void balance(int64_t n_x, const double *W, const Settings *settings, double *scale, double *work)
+/* d that makes the sum of S_ij d_j^2/d_i^2 smallest, as `_balance` of growth.py; work has 3 n_x numbers. */
+static void balance(int64_t n_x, const double *S, const Settings *settings, double *scale, double *work)
 {
     double *square = work, *ratios = work + n_x, *inverses = ratios + n_x;
     for (int64_t i = 0; i < n_x; i++) square[i] = inverses[i] = 1;
@@ -103,8 +113,8 @@ static void balance(int64_t n_x, const double *W, const Settings *settings, doub
         for (int64_t i = 0; i < n_x; i++) {
             double row = 0, column = 0;
             for (int64_t j = 0; j < n_x; j++) {
-                row += W[i * n_x + j] * square[j];
-                column += W[j * n_x + i] * inverses[j];
+                row += S[i * n_x + j] * square[j];
+                column += S[j * n_x + i] * inverses[j];
             }
             row *= inverses[i];
             column *= square[i];
@@ -120,54 +130,55 @@ static void balance(int64_t n_x, const double *W, const Settings *settings, doub
     for (int64_t i = 0; i < n_x; i++) scale[i] = sqrt(square[i]);
 }
 
-/* Between which the squares of the norms of Y = A(t) B(s) lie, of upper triangular factors, for all s <= t: `least` is the
-   largest sum of squares of a row or column, `most` the sum of all; (n, S). work has (F + 2) S numbers. */
-static void bounds(int64_t n, int64_t columns, int64_t F, const double *A, const double *B, double *least, double *most,
-                   double *work)
+/* The entries of matrices at an instant t, W_LANES numbers apart. */
+static inline const double *at(const W *matrices, int64_t F, int64_t t)
 {
-    double *restrict column = work, *restrict row = column + F * columns, *restrict y = row + columns;
-    for (int64_t t = 0; t < n; t++, least += columns, most += columns) {
-        const int64_t S = PADDED(t + 1);
-        EACH(s) least[s] = most[s] = 0;
-        for (int64_t i = 0; i < F * columns; i++) column[i] = 0;
+    return (const double *)(matrices + t / W_LANES * F * F) + t % W_LANES;
+}
+
+/* Between which the squares of the norms of Y = A(t) B(s) lie, of upper triangular factors, for all s <= t: `least` is the
+   largest sum of squares of a row or column, `most` the sum of all; (n, PADDED(n)). work has F vectors. */
+static void bounds(int64_t n, int64_t F, const W *A, const W *B, double *least, double *most, W *work)
+{
+    for (int64_t t = 0; t < n; t++) for (int64_t s = 0; s <= t; s += W_LANES) {
+        const double *a = at(A, F, t);
+        const W *b = B + s / W_LANES * F * F;
+        W *column = work, largest = ALL(0.0), all = ALL(0.0);
+        for (int64_t j = 0; j < F; j++) column[j] = ALL(0.0);
         for (int64_t i = 0; i < F; i++) {
-            EACH(s) row[s] = 0;
+            W row = ALL(0.0);
             for (int64_t j = i; j < F; j++) {
-                EACH(s) y[s] = 0;
-                for (int64_t k = i; k <= j; k++) {
-                    const double a = A[(i * F + k) * columns + t], *b = B + (k * F + j) * columns;
-                    EACH(s) y[s] += a * b[s];
-                }
-                EACH(s) row[s] += y[s] * y[s];
-                EACH(s) column[j * columns + s] += y[s] * y[s];
+                W y = ALL(0.0);
+                for (int64_t k = i; k <= j; k++) y += a[(i * F + k) * W_LANES] * b[k * F + j];
+                row += y * y;
+                column[j] += y * y;
             }
-            EACH(s) most[s] += row[s];
-            EACH(s) least[s] = row[s] > least[s] ? row[s] : least[s];
+            largest = w_fmax(largest, row);
+            all += row;
         }
-        for (int64_t j = 0; j < F; j++) {
-            EACH(s) least[s] = column[j * columns + s] > least[s] ? column[j * columns + s] : least[s];
-        }
+        for (int64_t j = 0; j < F; j++) largest = w_fmax(largest, column[j]);
+        w_store(least + t * PADDED(n) + s, largest);
+        w_store(most + t * PADDED(n) + s, all);
     }
 }
 
 /* Rows of the length S, padded with zeros. */
 static inline void add(int64_t S, double factor, const double *restrict from, double *restrict to)
 {
-    EACH(i) to[i] += factor * from[i];
+    for (int64_t i = 0; i < S; i += 8) for (int64_t l = i; l < i + 8; l++) to[l] += factor * from[l];
 }
 
 /* ln of the norm of A(t) B(s), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest eigenvalue F times
    at most; of a norm below `least` fewer squarings do, as they bound it. work has (3 F + 1) PADDED(F) numbers. */
-static double log_norm(int64_t F, int64_t columns, const double *A, const double *B, double squarings, double least,
-                       double *work)
+static double log_norm(int64_t F, const double *A, const double *B, double squarings, double least, double *work)
 {
     const int64_t S = PADDED(F);
     double *G = work, *square = G + F * S, *row = square + F * S, result = 0, part = 0.5;
     for (int64_t i = 0; i < F * S; i++) G[i] = 0;
     for (int64_t i = 0; i < F; i++) {
-        EACH(j) row[j] = 0;
+        for (int64_t j = 0; j < S; j++) row[j] = 0;
         for (int64_t k = i; k < F; k++) for (int64_t j = k; j < F; j++) {
-            row[j] += A[(i * F + k) * columns] * B[(k * F + j) * columns];
+            row[j] += A[(i * F + k) * W_LANES] * B[(k * F + j) * W_LANES];
         }
         for (int64_t j = i; j < F; j++) add(S, row[j], row, G + j * S);
     }
@@ -200,30 +211,38 @@ static int quiet(int64_t n, int64_t F, const double *within, const Settings *s)
     return within[n - 1] <= log(s->great) && within[1] <= limit;
 }
 
-/* Whether deviations Z (F, n_x, S) from a motion at n instants, those at the first of them moved on, tell that its internal
-   dynamics are not unstable. Growth is that of the states x_i/scale_i; `within` is as for `quiet`, where all other growth
-   is less. 0 as well beyond moderate propagators, of which products with inverses lose digits.
-   work has S (2 F n_x + 4 F^2 + 2 n) + max(2 S n_x + F n_x S + n_x^2 + 3 n_x, S (F + 2), (3 F + 1) PADDED(F)) numbers. */
+/* Whether deviations Z (F, n_x, PADDED(n)) from a motion at n instants, those at the first of them moved on, tell that its
+   internal dynamics are not unstable. Growth is that of the states x_i/scale_i; `within` is as for `quiet`, where all other
+   growth is less. 0 as well beyond moderate propagators, of which products with inverses lose digits. work has the numbers
+   of W_LANES + 2 n PADDED(n) + 2 PADDED(n) F (n_x + F) + n_x (n_x + 3) + 3 F PADDED(F) + PADDED(F)
+   + W_LANES (n_x^2 + F n_x (F + 1)/2 + (F + 1) (n_x + 1)). */
 int64_t FN(growth)(int64_t n, int64_t n_x, int64_t F, const double *Z, const Settings *settings, double *work,
                    double *scale, double *within)
 {
-    const int64_t S = PADDED(n), matrices = F * F * S, all = F * n_x * S;
-    double *whole = work, *Q = whole + all, *P = Q + all, *inverses = P + matrices, *least = inverses + matrices;
-    double *most = least + n * S, *rest = most + n * S, *W = rest + 2 * S * n_x + all, best = 1;
+    const int64_t S = PADDED(n), blocks = S / W_LANES, all = F * n_x;
+    W *whole = (W *)(((uintptr_t)work + sizeof(W) - 1) / sizeof(W) * sizeof(W)), *Q = whole + blocks * all;
+    W *P = Q + blocks * all, *inverses = P + blocks * F * F, *rest = inverses + blocks * F * F;
+    double *least = (double *)(rest + n_x * n_x + all * (F + 1) / 2 + (F + 1) * (n_x + 1)), *most = least + n * S;
+    double *squares = most + n * S, *of_pair = squares + n_x * (n_x + 3), best = 1;
     const double least_part = exp2(-settings->squarings) * log((double)F);
-    for (int64_t e = 0; e < F * n_x; e++) EACH(t) whole[e * S + t] = Q[e * S + t] = Z[e * S + (t < n ? t : n - 1)];
-    all_orthonormal(S, F, n_x, Q, P);
-    all_inverse(S, F, P, inverses);
-    if (!moderate(matrices, P, inverses, settings->moderate)) return 0;
-    sum_of_squares(n, S, F, n_x, whole, Q, inverses, W, rest);
-    balance(n_x, W, settings, scale, W + n_x * n_x);
-    for (int64_t j = 0; j < F; j++) for (int64_t i = 0; i < n_x; i++) {
-        const double unit = 1 / scale[i], *z = whole + (j * n_x + i) * S;
-        EACH(t) Q[(j * n_x + i) * S + t] = z[t] * unit;
+    for (int64_t block = 0; block < blocks; block++) for (int64_t e = 0; e < all; e++) {
+        W *z = whole + block * all + e;
+        for (int64_t l = 0, t = block * W_LANES; l < W_LANES; l++, t++) (*z)[l] = Z[e * S + (t < n ? t : n - 1)];
+        Q[block * all + e] = *z;
     }
-    all_orthonormal(S, F, n_x, Q, P);
-    all_inverse(S, F, P, inverses);
-    bounds(n, S, F, P, inverses, least, most, rest);
+    for (int64_t k = 0; k < blocks; k++) {
+        orthonormal_rows(F, n_x, Q + k * all, P + k * F * F);
+        inverse(F, P + k * F * F, inverses + k * F * F);
+    }
+    if (!moderate(blocks * F * F, P, inverses, settings->moderate)) return 0;
+    sum_of_squares(n, F, n_x, whole, Q, inverses, squares, rest);
+    balance(n_x, squares, settings, scale, squares + n_x * n_x);
+    for (int64_t k = 0; k < blocks; k++) {
+        for (int64_t e = 0; e < all; e++) Q[k * all + e] = whole[k * all + e] / scale[e % n_x];
+        orthonormal_rows(F, n_x, Q + k * all, P + k * F * F);
+        inverse(F, P + k * F * F, inverses + k * F * F);
+    }
+    bounds(n, F, P, inverses, least, most, rest);
     within[0] = 0;
     for (int64_t apart = 1; apart < n; apart++) {
         int64_t first = apart;
@@ -235,7 +254,8 @@ int64_t FN(growth)(int64_t n, int64_t n_x, int64_t F, const double *Z, const Set
         for (int64_t k = apart - 1; k < n; k++) {
             const int64_t t = k < apart ? first : k, s = t - apart; /* the one that may be largest comes first */
             if (!(most[t * S + s] > best) || k == first) continue;
-            const double found = log_norm(F, S, P + t, inverses + s, settings->squarings, log(best) / 2, rest);
+            const double *a = at(P, F, t), *b = at(inverses, F, s);
+            const double found = log_norm(F, a, b, settings->squarings, log(best) / 2, of_pair);
             within[apart] = fmax(within[apart], found);
             best = fmax(best, exp(2 * found - least_part));
         }
