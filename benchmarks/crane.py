@@ -133,8 +133,8 @@ def along_the_path():
 
     def call():
         nodes, _ = path.continuation(TIMES[[0, -1]], q0, p, T / 50, 1000)
-        x, y, _ = path.newton(TIMES, nodes, p)
-        return actuation.grid(TIMES, np.vstack([x, y[3:9]]), p)  # of q, q', q''
+        jets, _ = path.newton(TIMES, nodes, p)
+        return actuation.grid(TIMES, jets, p)  # of q, q', q''
 
     return call
 

@@ -36,7 +36,7 @@ def ours():
 
     def call():
         run = sv.close(plant, law, x0, (0.0, END), timing=sv.Timing(substeps=1))
-        many = sv.close_many(run, cases(), threads=THREADS)
+        many = sv.close_many(run, cases(), executor=THREADS)
         largest = [many[f"max |{name}|"] for name in SIGNALS]
         return np.array([*largest, *(many[f"rms {name}"] ** 2 for name in SIGNALS)])
 

@@ -18,8 +18,9 @@ import numpy as np
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
-from servoctl.methods.flow import defect, deviations, tangents
+from servoctl.methods import flow
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
+from servoctl.methods.motion import breakpoints
 from servoctl.methods.stability import stability_function
 from servoctl.model.model import Model
 from servoctl.model.switching import switching
@@ -47,7 +48,8 @@ MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below wh
 SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
-_SETTINGS = MODERATE, SWEEPS, BALANCED, TINY, SQUARINGS  # of the growth in C
+_OF_VERDICT = UNSTABLE, EXPONENTIAL, FASTER, MOST_GROWTH, GREAT
+_SETTINGS = MODERATE, SWEEPS, BALANCED, TINY, SQUARINGS, *_OF_VERDICT  # of the growth in C
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
@@ -300,20 +302,25 @@ def quiet_by_series(model, run, last):
     x, size = _states(model, run), _sizes(model, run)
     if len(run.variants) > 1 or switching(model) is not None or not np.isfinite(x[:, [0, -1]]).all():
         return False
-    between, idle = np.linspace(run.t[0], run.t[-1], BLOCKS + 1), int(np.count_nonzero(~model.active_states))
-    first = tangents(model, last, run.t[0], x[:, 0], size)
-    moved = None if first is None else deviations(model, last, between, x[:, 0], run.knots, size, first, idle)
-    if moved is None or not _small(np.abs(moved.x - x[:, -1]), size):
+    between, cuts = np.linspace(run.t[0], run.t[-1], BLOCKS + 1), breakpoints((run.t[0], run.t[-1]), run.knots)
+    moved = flow.Deviations(model, last, cuts, x[:, 0], size, between)
+    reached = moved.begin() and moved.move() and _small(np.abs(moved.x - x[:, -1]), size)
+    if not reached or not moved.defect() <= DEFECT:
         return False
-    Q = moved.Q
-    if not defect(model, last, run.t[-1], x[:, -1], size, Q[-1]) <= DEFECT:
-        return False
+    quiet, _, _ = flow.growth(moved.Z, len(between), _SETTINGS)
+    return quiet or _quiet_by_steps(model, last, between, cuts, x[:, 0], size)
+
+
+def _quiet_by_steps(model, last, between, cuts, x, size):
+    """The same by propagators over steps that end at all instants, whatever their sizes."""
     forward = np.sign(between[-1] - between[0])
-    ends = np.searchsorted(forward * moved.t, forward * between)
-    corners = Tangents(model.state_names, moved.t, size, Q, Q)
-    logs, scale = moved.growth(*_SETTINGS)
-    growth = (ends, logs, scale) if scale is not None else _growth(corners, _propagators(moved.R, ends))
-    return not _unstable(corners, moved.R, *growth)
+    moved = flow.Deviations(model, last, forward * np.union1d(forward * between, forward * np.array(cuts)), x, size)
+    steps = moved.by_step() if moved.begin() else None
+    if steps is None:
+        return False
+    t, Q, R = steps
+    corners, ends = Tangents(model.state_names, t, size, Q, Q), np.searchsorted(forward * t, forward * between)
+    return not _unstable(corners, R, *_growth(corners, _propagators(R, ends)))
 
 
 def _spread(t, x):

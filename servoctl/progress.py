@@ -4,7 +4,7 @@ import inspect
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from servoctl.errors import SpecificationError
 
@@ -16,9 +16,23 @@ _stages = []  # those under way, the innermost last
 
 def progress_bar(name, wanted, total=None, **options):
     """A bar of tqdm, with its options, that appears where work takes long; `wanted` None means on a terminal."""
+    if not _shown(wanted):
+        return _NoBar()
     from tqdm import tqdm
 
-    return tqdm(desc=name, total=total, disable=not _shown(wanted), **{"delay": PATIENCE, **options})
+    return tqdm(desc=name, total=total, **{"delay": PATIENCE, **options})
+
+
+class _NoBar(nullcontext):
+    """What is updated as a bar is, and shows nothing."""
+
+    n = 0
+
+    def __enter__(self):
+        return self
+
+    def update(self, count=1):
+        """Nothing."""
 
 
 @contextmanager

@@ -176,6 +176,13 @@ class Run(Sampled, Value):
 
     __hash__ = Value.__hash__
 
+    def with_verdict(self, verdict):
+        """The same run with another verdict."""
+        run = object.__new__(Run)
+        vars(run).update(vars(self), verdict=verdict)
+        vars(run).pop("_internal", None)
+        return run
+
     @property
     def internal(self) -> Mapping[str, object]:
         """The verdict on the internal dynamics along the run (`InternalDynamics.facts`), computed at the first access.

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,7 +62,7 @@ from servoctl.run import SAME_TIME, Run
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
-_TOLD = WeakKeyDictionary()  # model -> what told that errors along its last motion do not grow
+FEW_STEPS = 100  # of a motion, up to which its series tell about growth sooner than a bound does
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
@@ -149,14 +148,14 @@ def simulate(
 
     if not _has_internal_dynamics(model) or not _integrates(method):
         return motion(t_eval)
-    times = None if t_eval is None else _sample_times(*span, t_eval, (), method)
-    tolerance, own = getattr(method, "rtol", STEP_ERROR), partial(_with_own, method, span, times)
+    times = None if t_eval is None else sample_times(*span, t_eval, (), method)
+    tolerance, own = getattr(method, "rtol", STEP_ERROR), _own_times(method, span, times)
     try:
         enough = own(FEWEST + 1)
         run = motion(times if enough is None else enough)
     except ServoError as error:
         if error.run is not None:
-            error.run = _sampled(replace(error.run, verdict=partial(_verdict, tolerance=tolerance)), times)
+            error.run = _sampled(error.run.with_verdict(partial(_verdict, tolerance=tolerance)), times)
         raise
     dense = own(DEFAULT_SAMPLES)
     again = None if dense is None else partial(motion, dense)
@@ -166,7 +165,7 @@ def simulate(
 
 def _series_of(run, method):
     """Highest index of the coefficients with which a run was computed; None if it is none of the Taylor method."""
-    if run.method != str(Taylor()):
+    if run.method != Taylor.__name__:
         return None
     return last_index(run.model, Taylor() if method is None else as_method(method))
 
@@ -176,16 +175,23 @@ def _integrates(method):
     return method is None or as_method(method).forward
 
 
-def _with_own(method, span, times, count):
-    """Times of samples and `count` more along the span; None for all steps, the default, or samples as dense."""
+def _own_times(method, span, times):
+    """A function that gives the samples and a count of others along the span.
+
+    It gives None for all steps, the default, or samples that are as dense.
+    """
     fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
     if times is None or fixed_steps:
-        return None
-    gap = np.abs(times[1:] - times[:-1]).max(initial=0.0)
+        return lambda count: None
+    gap, length = np.abs(times[1:] - times[:-1]).max(initial=0.0), abs(span[1] - span[0])
     whole = times[0] == span[0] and times[-1] == span[1]
-    if whole and (count - 1) * gap <= abs(span[1] - span[0]) * (1 + SAME_TIME):
-        return None
-    return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
+
+    def own(count):
+        if whole and (count - 1) * gap <= length * (1 + SAME_TIME):
+            return None
+        return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
+
+    return own
 
 
 def _sampled(run, times):
@@ -208,19 +214,13 @@ def _sampled(run, times):
 def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, events=None, progress=None):
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
-    drift = as_drift(drift)
-    method = default_method(model, drift) if method is None else as_method(method)
-    require_combination(model, method, drift)
-    if isinstance(drift, Poles):
-        _require_decay(model, drift, t0, t1)
-        if str(method) in EXPLICIT:
-            warn_many_steps(str(method), drift.by_row(model), t1 - t0)
+    method, drift = _method_and_drift(model, method, drift, t0, t1)
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
     x0 = (as_state if leads_back else consistent_state)(model, start, t0)
     knots = model.require_smooth((min(span), max(span)))
     if not isinstance(method, Algebraic):
         knots = tuple(sorted({*knots, *model.ends_of_pieces((min(span), max(span))).tolist()}))
-    times = None if isinstance(method, Bounded) and t_eval is None else _sample_times(t0, t1, t_eval, knots, method)
+    times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:
         model, motion = _derived_along(model, method, drift, problem, bar)
@@ -230,20 +230,37 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         motion.note = f"by {method}, since {unsuited}"
     finally:
         bar.close()
-    with without_interruption() as pressed:  # a motion that is computed is kept
+
+    def finished():
         end_at_other_orders(motion)
         started = _as_started(model, start, t0, x0 if motion.start is None else motion.start)
         run = _run(model, motion, (method, drift, knots), started, t1)
-        if t_eval is not None and isinstance(method, RungeKutta):
-            run = _resample(run, times)
-    if pressed and run.status == 0:
-        run = _interrupted_at_its_end(run)
+        return _resample(run, times) if t_eval is not None and isinstance(method, RungeKutta) else run
+
+    try:
+        run = finished()
+    except KeyboardInterrupt:  # a motion that is computed is kept
+        with without_interruption():
+            run = finished()
+        run = _interrupted_at_its_end(run) if run.status == 0 else run
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
     if run.success and not model.flat and not motion.drifted <= DRIFTED:
         _warn_drifted(run)
     return run
+
+
+def _method_and_drift(model, method, drift, t0, t1):
+    """Method and treatment of drift, which go together over a span [s]."""
+    drift = as_drift(drift)
+    method = default_method(model, drift) if method is None else as_method(method)
+    require_combination(model, method, drift)
+    if isinstance(drift, Poles):
+        _require_decay(model, drift, t0, t1)
+        if str(method) in EXPLICIT:
+            warn_many_steps(str(method), drift.by_row(model), t1 - t0)
+    return method, drift
 
 
 def _interrupted_at_its_end(run):
@@ -285,7 +302,7 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     -------
     Run
     """
-    known = replace(run, verdict=partial(_verdict, tolerance=tolerance))
+    known = run.with_verdict(partial(_verdict, tolerance=tolerance))
     try:
         if not run.success or _quiet(run, by_series):
             return known
@@ -297,22 +314,15 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
         return _interrupted_at_its_end(known)
     if internal.verdict == "unstable":
         warn_unstable(internal.sentence(tolerance))
-    return replace(run, verdict=internal.facts(tolerance))
+    return run.with_verdict(internal.facts(tolerance))
 
 
 def _quiet(run, by_series):
-    """Whether the bound of the growth, or the series, tell that it deserves no warning.
-
-    What told it of the last motion of a model comes first.
-    """
-    ways = {"bound": lambda: growth_bound(run.model, run) <= UNSTABLE}
+    """Whether the series, or the bound of the growth, tell that it deserves no warning; the quicker comes first."""
+    ways = [lambda: growth_bound(run.model, run) <= UNSTABLE]
     if by_series is not None:
-        ways["series"] = lambda: quiet_by_series(run.model, run, by_series)
-    last = _TOLD.get(run.model)
-    told = next((way for way in sorted(ways, key=lambda way: way != last) if ways[way]()), None)
-    if told is not None and told != last:
-        _TOLD[run.model] = told
-    return told is not None
+        ways.insert(run.counters["steps"] > FEW_STEPS, lambda: quiet_by_series(run.model, run, by_series))
+    return any(way() for way in ways)
 
 
 def _verdict(run, _=None, *, tolerance):
@@ -542,7 +552,7 @@ def as_state(model, start, t0):
 
 def _as_started(model, start, t, x):
     """The state from which a motion was computed: `start`, or what the method has made of it."""
-    if isinstance(start, State) and np.array_equal(start.values, x):
+    if isinstance(start, State) and (start.values == x).all():
         return start
     off = np.abs(_scaled_residuals(model, t, x)[2]).max(initial=0.0)
     facts = {"held": start.held, "free": start.free} if isinstance(start, State) else {"held": (), "free": ()}
@@ -585,20 +595,22 @@ def _default_times(t0, t1, knots):
     return np.array(sorted({*times.tolist(), *map(float, inside)}))  # np.union1d imports np.ma
 
 
-def _sample_times(t0, t1, t_eval, knots, method=None):
+def sample_times(t0, t1, t_eval, knots, method=None):
+    """The instants of the samples of a motion by a method, in its order; with the knots where none are given."""
     if t_eval is None:
         times = _default_times(t0, t1, knots)
     else:
         times = as_numbers(t_eval)
-        if times.ndim != 1 or not np.all(times[1:] > times[:-1]):
+        if times.ndim != 1 or not (times[1:] > times[:-1]).all():
             times = np.unique(times)
-        if not np.all(np.isfinite(times)):
+        if times.size and not np.isfinite(times[[0, -1]]).all():  # of ascending ones
             raise SpecificationError(
                 f"t_eval={repr(t_eval)[:150]} was given.", "It is a sequence of finite times [s].", t_eval=t_eval
             )
         window = method is not None and isinstance(as_method(method), Bounded)  # which is known with the motion
         low, high = (-np.inf, np.inf) if window else (min(t0, t1), max(t0, t1))
-        if not times.size or times[0] < low - SAME_TIME or times[-1] > high + SAME_TIME:
+        margin = SAME_TIME * max(1.0, abs(t0), abs(t1))
+        if not times.size or times[0] < low - margin or times[-1] > high + margin:
             covered = f"covers {times[0]:g} to {times[-1]:g} s" if times.size else "is empty"
             raise SpecificationError(
                 f"t_eval {covered}.",
@@ -606,6 +618,8 @@ def _sample_times(t0, t1, t_eval, knots, method=None):
                 t_eval=t_eval,
                 t_span=(t0, t1),
             )
+        if times[0] < low or times[-1] > high:  # by rounding
+            times = np.unique(np.clip(times, low, high))
     return times if t1 > t0 else times[::-1]
 
 

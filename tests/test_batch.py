@@ -95,8 +95,8 @@ def test_lanes_and_threads_do_not_change_a_case(plan, cases, monkeypatch):
         study = sv.close_many(one, cases, scale={"x": "wind"}, **options).study
         return np.array([study[name] for name in study.columns if name not in ("error", "message", "case")])
 
-    everything = results(cases, threads=1)
-    assert np.array_equal(results(cases, threads=3), everything)
+    everything = results(cases, executor=1)
+    assert np.array_equal(results(cases, executor=3), everything)
     assert np.array_equal(results(few), everything[:, :5])
     for n in (1, 4, 8):
         monkeypatch.setattr(batch, "lanes", lambda n=n: n)

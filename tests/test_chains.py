@@ -1,6 +1,7 @@
 """Short chains of operations: the same values as the given statements, of which the last follows sooner."""
 
 import ctypes
+import itertools
 import re
 
 import casadi as ca
@@ -197,7 +198,10 @@ def test_all_ways_give_the_same_values(scene):
 IN_LONG_NUMBERS = {
     ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply, ca.OP_DIV: np.divide, ca.OP_NEG: np.negative,
     ca.OP_SQ: np.square, ca.OP_TWICE: lambda a: 2 * a, ca.OP_INV: lambda a: 1 / a, ca.OP_SIN: np.sin, ca.OP_COS: np.cos,
-    ca.OP_TAN: np.tan,
+    ca.OP_TAN: np.tan, ca.OP_ATAN: np.arctan, ca.OP_ATAN2: np.arctan2, ca.OP_SQRT: np.sqrt, ca.OP_FMIN: np.fmin,
+    ca.OP_FMAX: np.fmax, ca.OP_FABS: np.abs, ca.OP_SIGN: np.sign, ca.OP_LT: np.less, ca.OP_LE: np.less_equal,
+    ca.OP_NE: np.not_equal, ca.OP_NOT: np.logical_not, ca.OP_CONSTPOW: np.power,
+    ca.OP_IF_ELSE_ZERO: lambda a, b: np.where(a, b, 0.0 * b),
 }  # fmt: skip
 
 
@@ -231,14 +235,56 @@ def test_collected_rates_are_as_accurate_in_all_units(scene):
         assert own <= 2 * reference + np.finfo(float).eps
 
 
+@np.errstate(all="ignore")
+@pytest.mark.parametrize("scene", ("overhead-crane", "crane-3d", "vtol", "slung-load", "rotary-crane", "three-cars", "beam-crane"))
+def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):
+    """Against extended precision, at states near the path and on its knots, where conditions decide alike."""
+    model = gallery_model(scene)
+    f, nq, rng = model.function("path").expression, model.nq, np.random.default_rng(6)
+    given = gallery.gallery[scene]
+    run = sv.simulate(model, model.start(**given.start, guess=given.guess), given.t_span)
+    t, x = run.t, run.jets[:nq] * (1 + 1e-4 * rng.normal(size=(nq, len(run.t))))
+    p = np.broadcast_to(model.parameters[:, None], (len(model.parameters), len(t)))
+    given = emit.tabulated(emit._statements(f, emit.SCALAR))[0]
+    exact = evaluated(given, t.astype(np.longdouble), x.astype(np.longdouble), p.astype(np.longdouble))
+    finite = np.isfinite(exact).all(axis=0)  # elsewhere a pivot is zero
+    size = np.abs(exact[:, finite]).max(axis=1, keepdims=True)
+    assert finite.mean() > 0.99
+
+    def error(some):
+        off = np.abs(evaluated(some, t, x, p) - exact)[:, finite]
+        return (off / np.where(size > 0, size, 1.0)).max(axis=0).astype(float)
+
+    own, reference = error([*itertools.chain(*emit.by_phase(f, nq)[0])]), error(emit._with_reciprocals(given))
+    for some in (np.median, np.max):
+        assert some(own) <= 2 * some(reference) + np.finfo(float).eps
+
+
+def test_conditions_are_evaluated_once():
+    """Derivatives of a clamped path repeat its conditions; these keep their operations, so that they change alike."""
+    late, beyond = T / 3 <= 0, T / 3 > 1
+    clamped = ca.if_else(late, 0, ca.if_else(beyond, 1, T / 3))
+    f = function(ca.jacobian(clamped**3 * X[0], T), ca.jacobian(ca.jacobian(clamped**3, T), T) * X[1])
+    given, *collected = ways(statements(f, chained=False))
+    assert [operation for _, operation, _ in given].count(ca.OP_IF_ELSE_ZERO) == 11
+    for some in collected:
+        operations = [operation for _, operation, _ in some]
+        assert operations.count(ca.OP_NE) == 0 and operations.count(ca.OP_LE) + operations.count(ca.OP_LT) == 2
+        assert (operations.count(ca.OP_DIV), operations.count(ca.OP_IF_ELSE_ZERO)) == (1, 6)
+        for t in (-1.0, 0.0, 1.3, 3.0, np.nextafter(3.0, 4.0), 5.0):
+            x = np.array([0.3, -2.0, 0.0, 0.0])
+            np.testing.assert_allclose(evaluated(some, t, x, np.ones(3)), np.array(f(t, x, 1)).ravel(), rtol=1e-14, atol=0)
+
+
 def test_small_differences_keep_their_digits():
     """What is multiplied out has no differences of larger terms than before."""
-    f = function((X[0] - X[1]) * (X[0] + X[1]) * A + (X[0] - X[1]) ** 2 * B, (X[0] - X[1]) * A + (X[1] - X[0]) * B)
+    f = function((X[0] - X[1]) * (X[0] + X[1]) * A + (X[0] - X[1]) ** 2 * B, (X[0] - X[1]) * A + (X[1] - X[0]) * B,
+                 1e6 * (X[1] - 1) + A * X[2] + B * X[3])
     x, p = np.array([1.0, 1.0 + 1e-12, 0, 0]), [1.0, 3.0, 1.0]
     values = [np.array(ca.Function("way", f.sx_in(), [way])(0, x, p)).ravel() for way in emit.other_ways(f)]
     d = x[0] - x[1]
     for value in values:
-        np.testing.assert_allclose(value, [d * (x[0] + x[1]) + 3 * d**2, -2 * d], rtol=1e-14)
+        np.testing.assert_allclose(value, [d * (x[0] + x[1]) + 3 * d**2, -2 * d, -1e6 * d], rtol=1e-14)
 
 
 def test_a_long_function_is_left_as_it_is():

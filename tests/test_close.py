@@ -206,15 +206,15 @@ def test_measurements_are_the_states_that_a_law_measures(crane_plan, make, senso
 
 
 @pytest.mark.parametrize("is_compiled", [True, False])
-def test_changes_of_measurements_leave_the_states(is_compiled, monkeypatch):
+def test_measurements_and_states_are_not_changed(is_compiled, monkeypatch):
     plant = sv.plant(POINT)
     if not is_compiled:
         monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, suffix: None)
     run = sv.close(plant, lambda t, y: [-y["x"] - y["dx"]], [1.0, 0.5], (0.0, 1.0), timing=sv.Timing(rate=20.0))
     assert np.array_equal(run.measurements, run.states)
-    before = run.states.copy()
-    run.measurements[:] = np.nan
-    assert np.array_equal(run.states, before)
+    for array in (run.measurements, run.states):  # which may be one
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = np.nan
 
 
 def test_a_law_with_a_controller_state_is_started(crane_plan):

@@ -92,6 +92,12 @@ def every_operation():
     return expressions, x
 
 
+def without_erfinv(expressions):
+    """The expressions whose operations have the bits of CasADi in C."""
+    other = ca.SX.unary(ca.OP_ERFINV, X2[0])
+    return [e for e in expressions if not ca.is_equal(ca.SX(e), other, 2)]
+
+
 def test_every_operation_equals_casadi(monkeypatch, c_compiler):
     monkeypatch.setattr(functions, "GRID_POINTS", 0)
     expressions, x = every_operation()
@@ -118,7 +124,8 @@ def test_operations_on_many_points_at_once_have_the_bits_of_single_points(with_c
     f, (a, b) = function(*expressions), X2.elements()
     guarded = function(ca.if_else(a > 0, b, 3.0), ca.copysign(2.0, 2.0) * a, a - a, 0.0, -0.0, T, x=X2)
     rng, n = np.random.default_rng(8), x.shape[1]
-    for g, p in itertools.product((f, guarded, random_function(900)), (np.array([1.5]), rng.normal(size=(1, n)))):
+    every = f, function(*without_erfinv(expressions)), guarded, random_function(900)
+    for g, p in itertools.product(every, (np.array([1.5]), rng.normal(size=(1, n)))):
         once, again, t = np.empty((g.numel_out(0), n)), np.empty((g.numel_out(0), n)), rng.normal(size=n)
         evaluator = Interpreter(g)
         for k in range(n):
@@ -205,13 +212,14 @@ void f_again(double t, const double *x, const double *other, const double *p, do
     np.testing.assert_array_equal(in_buffer(compiled(f, "f", ("rk",)), 0.3, x, p), y)
 
 
-@pytest.mark.parametrize(("name", "share"), [("overhead-crane", 0.3), ("crane-3d", 0.3), ("three-cars", 0.15)])
+@pytest.mark.parametrize(("name", "share"), [("overhead-crane", 0.15), ("crane-3d", 0.2), ("three-cars", 0.15)])
 def test_a_newton_correction_takes_few_of_the_operations_of_a_point(gallery_model, name, share):
     f = gallery_model(name).function("path")
-    text = emit.phases(f.expression, "f", f.n_x, chunk=10**9)
+    text = emit.phases(f.expression, "f", emit.by_phase(f.expression, f.n_x), chunk=10**9)
     body = dict(zip(emit.PHASES, re.split(r"void f_\w+\(", text)[1:], strict=True))
     lines = {phase: body[phase].count("const double a") for phase in emit.PHASES}
-    assert lines["instant"] > 0.25 * f.operations and lines["correction"] < share * f.operations
+    every = sum(lines.values())
+    assert lines["instant"] > 0.25 * every and lines["correction"] < share * every and every < 0.85 * f.operations
     assert not re.search(r"\bt [-+*/]|\(t\b", body["correction"].split("\n", 1)[1]), "nothing of t alone is repeated"
 
 
@@ -277,9 +285,7 @@ def test_points_of_a_function_called_often_are_compiled_with_the_bits_of_casadi(
     expressions, x = every_operation()
     a, b = X2[0], X2[1]
     sums = a * b + P1, T * b - a * a, a / (b + 3) + T / (b + 3), ca.sin(a * b) ** 2 + ca.cos(a * b) ** 2, a**2.0 * b
-    other = ca.SX.unary(ca.OP_ERFINV, a)
-    expressions = [e for e in (*expressions, *sums) if not ca.is_equal(ca.SX(e), other, 2)]
-    for f in (function(*expressions), random_function(1500)):
+    for f in (function(*without_erfinv([*expressions, *sums])), random_function(1500)):
         model, n = compiled(f, "points"), x.shape[1]
         reference = np.asarray(f.map(n)(np.full((1, n), 2.5), x, np.full((1, n), 1.5)))
         often(monkeypatch, model)
@@ -533,8 +539,9 @@ def along(model, t, x0, p, most=4000):
     if not len(nodes):
         return np.empty((model.n_x, 0)), np.empty((model.n_y, 0)), first
     solved = t[np.abs(t - t[0]) <= abs(nodes[-1, 0] - t[0])]
-    x, y, second = model.newton(solved, nodes, p)
-    return x, y, first + second
+    z, second = model.newton(solved, nodes, p)
+    x = z[: model.n_x]
+    return x, np.concatenate([np.zeros_like(x), z[model.n_x :]]), first + second
 
 
 def test_newton_on_a_cubic(backend):

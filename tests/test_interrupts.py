@@ -187,7 +187,7 @@ def test_many_loops_are_interrupted_and_the_finished_ones_kept(plan, law, ctrl_c
 
     with monkeypatch.context() as patched:
         patched.setattr(batch, "ThreadPoolExecutor", threads)
-        many = sv.close_many(run, {"m_load": loads}, record=["theta"], every=100, threads=2)
+        many = sv.close_many(run, {"m_load": loads}, record=["theta"], every=100, executor=2)
     assert many.study.meta["interrupted"] and 0 < len(many) < len(loads)
     case = many["case"]
     np.testing.assert_array_equal(many["m_load"], loads[case])

@@ -46,8 +46,8 @@ def test_samples_are_not_copied_when_a_motion_ends(method, wheel, gallery_model,
     reserved, reserve = [], Motion._reserve
     monkeypatch.setattr(Motion, "_reserve", lambda self, *given: reserved.append(given[0]) or reserve(self, *given))
     run = sv.simulate(model, start, (0.0, 1.0), method)
-    in_one_call = [] if method == "Taylor" else [len(run.t)]  # whose samples are an array of their own
-    assert reserved == in_one_call and run.jets.flags.c_contiguous
+    in_one_call = method in (None, "Taylor")  # whose samples are an array of their own
+    assert reserved == ([] if in_one_call else [len(run.t)]) and run.jets.flags.c_contiguous
 
 
 @pytest.mark.parametrize("end", [1.4, 3.9])

@@ -96,7 +96,7 @@ def test_lanes_measure_what_one_loop_measures(plan, monkeypatch, n):
     law = sv.pd(plan, plant, rate=100.0, kp={"trolley": 1e3, "hoist": 1e3}, kd={"trolley": 50.0, "hoist": 50.0})
     sensors = sv.Sensors(noise={"x": 1e-2, "dl": 1e-3}, quantisation={"x": 1e-5}, seed=2)
     one = sv.close(plant, law, plan.state(0.0), (0.0, 0.5), sensors=sensors)
-    many = sv.close_many(one, {"m_load": np.full(19, 100.0)}, record=["trolley", "hoist"], threads=2)
+    many = sv.close_many(one, {"m_load": np.full(19, 100.0)}, record=["trolley", "hoist"], executor=2)
     for i in (0, 7, 18):
         own = sv.Sensors(noise=sensors.noise, quantisation=sensors.quantisation, seed=int(many["seed"][i]))
         alone = sv.close(plant, law, plan.state(0.0), (0.0, 0.5), sensors=own)

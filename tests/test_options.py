@@ -50,6 +50,16 @@ def test_times_of_samples(times, scene):
     stopped("t_eval=", lambda: sv.simulate(*scene, SPAN, t_eval=times))
 
 
+@pytest.mark.parametrize("span", [(0.0, 0.2), (0.2, 0.0), (3e4, 3e4 + 0.2)])
+@pytest.mark.parametrize("method", [*ADAPTIVE, "RK4"])
+def test_times_of_samples_that_rounding_puts_beyond_the_span_are_its_ends(method, span, scene):
+    model, x = scene[0], scene[1].values
+    ends = [np.nextafter(span[0], 2 * span[0] - span[1]), np.nextafter(span[1], 2 * span[1] - span[0])]
+    run = sv.simulate(model, x, span, method, t_eval=[ends[0], np.mean(span), ends[1]])
+    assert run.t.tolist() == [span[0], np.mean(span), span[1]]
+    assert sv.simulate_many(model, x, None, span, method, t_eval=[*ends, span[1]], executor=1).t.tolist() == [*span]
+
+
 def test_whole_numbers(scene):
     for options in ({"order": True}, {"order": 5.0}, {"order": "a"}, {"jets": True}, {"jets": 2.5}):
         stopped(next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method=sv.Taylor(**options)))

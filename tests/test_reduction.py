@@ -17,6 +17,7 @@ from servoctl.methods.choice import Adaptive
 from servoctl.model.model import derive
 from servoctl.reduction import hidden
 from servoctl.simulation import simulate
+from servoctl.study.many import simulate_many
 from servoctl.tolerances import EXTENDED
 from servoctl.verification import verify
 
@@ -102,15 +103,36 @@ GALLERY = {
     "steady-satellite": ([3, 2], {"steady": 0}),
     "bicycle": ([1, 0], {"speed": 1, "curvature": 2}),
 }
+ROLLED = {"wheeled-robot": 1, "trailers": 3, "bicycle": 2}  # coordinates beyond the velocities, which start anywhere
 
 
 @pytest.mark.parametrize("name", gallery)
 def test_orders_free_values_and_needs_of_the_gallery(name, gallery_model):
     model, (final, needs) = gallery_model(name), GALLERY[name]
     assert orders(model) == final
-    assert model.free == sum(final) and model.flat == (sum(final) == 0)
+    assert model.free == sum(final) + ROLLED.get(name, 0) and model.flat == (model.free == 0)
+    assert model.free == len(model.state_names) - len(model.invariant_names())
     assert {key: model.reduction.needs[key] for key in needs} == needs
-    assert sum(model.raised.values()) == model.reduction.top * model.n - model.free
+    assert sum(model.raised.values()) == model.reduction.top * model.n - sum(final)
+
+
+def test_where_velocities_alone_are_determined_the_motion_is_integrated():
+    """x' = v cos ψ, y' = v sin ψ, ψ' = r with x and ψ programmed: y starts anywhere, and y' = tan ψ x'."""
+    plane = sv.coordinates("x y psi")
+    psi = list(plane)[2]
+    q = plane.with_quasi_velocities("v r", [[ca.cos(psi), 0], [ca.sin(psi), 0], [0, 1]])
+    x, y, _ = q
+    body = sv.rigid_body(q, 20.0, (0, 0, 1.5), position=(x, y), rates=(0, 0, q.w()[1]))
+    mechanism = sv.Mechanism(q, gibbs=body, actuators={"drive": (1, 0), "steer": (0, 1)})
+    model = derive(mechanism, sv.Program({"along": x - q.t, "heading": psi - q.t}))
+    assert model.free == 1 and not model.flat and "flat" not in repr(model)
+    start, last = model.start(y=0.5), 0.5 - np.log(np.cos(0.7))
+    runs = [simulate(model, start, (0.0, 0.7), **options) for options in ({}, {"method": "RK4", "t_eval": [0.3, 0.7]})]
+    assert [run["y"][-1] for run in runs] == pytest.approx([last] * 2, rel=1e-9)
+    assert runs[0]["v"] == pytest.approx(1 / np.cos(runs[0].t), rel=1e-9)
+    many = simulate_many(model, {"y": [0.5, 1.5]}, None, (0.0, 0.7), t_eval=[0.3])
+    assert many["final y"] == pytest.approx([last, last + 1], rel=1e-9)
+    assert many.trace["drive"][0] == pytest.approx(runs[1]["drive"][0], rel=1e-9)
 
 
 @pytest.mark.parametrize("alpha", [1e-5, 1e-6, *([2e-7] if EXTENDED else [])])  # sin²α is above the noise of pivots
@@ -272,7 +294,7 @@ def test_the_rate_of_a_constant_heading_of_a_moving_car_holds_its_steering_strai
     with warned("'heading'", "product", "tan(delta) or v"):
         model = derive(mechanism, program)
     run = simulate(model, model.start(x=0.0, y=0.0, psi=0.3), (0.0, 3.0))
-    assert model.free == 1 and run.message == "finished" and verify(model, run).passed
+    assert model.free == 3 and run.message == "finished" and verify(model, run).passed
     assert run["x"][-1] == pytest.approx(3.0 * scale * np.cos(0.3), rel=1e-12)
     assert run["psi"] == pytest.approx(0.3, abs=1e-12) and run["delta"] == pytest.approx(0.0, abs=1e-12)
 

@@ -7,9 +7,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 
 import servoctl as sv
+from servoctl.codegen import emit
 from servoctl.codegen.interpreted import rough_log2
 from servoctl.gallery import gallery
-from servoctl.methods.taylor import TaylorSteps, series_loop
+from servoctl.methods.independent import in_independent
+from servoctl.methods.taylor import TaylorSteps, series_loop, taylor_coefficients
+from servoctl.model.equations import Equations
 from servoctl.simulation import simulated
 
 
@@ -154,6 +157,16 @@ def disc(by_hand):
     return model, model.start(x=0.0, y=0.0, psi=0.2, phi=0.0, **velocities)
 
 
+def disc_as_given():
+    return disc(by_hand=False)
+
+
+def appell_hamel():
+    """The mechanism of the gallery while its wheel turns."""
+    model = sv.derive(*gallery["appell-hamel"].build())
+    return model, model.start(x=0.0, y=0.0, phi=0.0, theta=0.3, dphi=1.0, dtheta=0.5)
+
+
 @pytest.mark.parametrize("scene", [trailer, sled, driven, bead])
 def test_rates_that_rows_determine_satisfy_them_to_rounding(scene, rtol=1e-7):
     model, start = scene()
@@ -180,6 +193,43 @@ def test_a_mechanism_as_given_takes_the_steps_of_one_reduced_by_hand():
         ends.append([run[name][-1] for name in ("x", "y", "psi", "phi")])
     assert steps[0] <= steps[1]
     np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-7)
+
+
+def pinned():
+    """A bar by the place of its centre and its angle, on a pin, beside a cart whose speed is prescribed."""
+    q, p = sv.coordinates("x y theta s"), sv.parameters(m=2.0, l=0.7, I=0.1, k=3.0)
+    x, y, theta, s = q
+    S = sv.particle(q, p.m, (x, y)) + p.I * q.d(2)[2] ** 2 / 2 + q.d(2)[3] ** 2 / 2
+    pin = {"across": x - s - p.l * ca.sin(theta), "down": y + p.l * ca.cos(theta)}
+    potential = 9.81 * p.m * y + p.k * theta**2 / 2
+    mechanism = sv.Mechanism(q, gibbs=S, potential=potential, parameters=p, constraints=pin)
+    model = sv.derive(mechanism, sv.Program({"speed": q.d(1)[3] - 0.4}, by="ideal"))
+    return model, model.start(theta=0.4, s=0.0, dtheta=1.0, guess={"x": 0.3, "y": -0.6})
+
+
+@pytest.mark.parametrize("scene", [appell_hamel, disc_as_given, pinned])
+def test_balances_in_independent_velocities_give_the_same_series_by_fewer_products(scene, monkeypatch):
+    model, start = scene()
+    e, p = model.equations, np.append(model.parameters, 0.25)
+    few = taylor_coefficients(e, 12)
+    assert in_independent(e) is not None
+    monkeypatch.setattr("servoctl.methods.taylor.in_independent", lambda equations: None)
+    many = taylor_coefficients(e, 12)
+    assert emit.operations(few) < 0.85 * emit.operations(many)
+    determined = 1 - np.array(series_loop(model, 12).sizes["free"])
+    off = np.append(np.zeros(model.nq), 0.1 * determined)  # what rows determine plays no part, whatever the state says
+    exact, found = (np.array(f(0.0, start.values + off, p)).ravel() for f in (many, few))
+    first = model.nq * 12 * (not model.reduction.mechanism.q.plain)
+    gamma = [np.reshape(y[first : first + 12 * model.n], (12, model.n)) for y in (exact, found)]
+    np.testing.assert_allclose(gamma[1], gamma[0], rtol=0, atol=1e-13 * np.abs(gamma[0]).max())
+    np.testing.assert_allclose(found, exact, rtol=1e-10, atol=1e-12)
+
+
+def test_balances_stay_as_given_where_nothing_is_gained_or_pivots_are_chosen(gallery_model):
+    assert in_independent(gallery_model("cart-pole").equations) is None
+    model, _ = appell_hamel()
+    chosen = tuple((k, k) for k in range(model.n))
+    assert in_independent(Equations(model.reduction.with_order(chosen))) is None
 
 
 def test_a_motion_without_change_takes_one_step():

@@ -313,6 +313,15 @@ def test_changed_forces_fail(name, which, plan):
     assert "signals" in proof.failures and ("acceleration" in proof.failures) == (name != "energy")
 
 
+def test_changed_rates_of_signals_fail_and_what_the_model_does_not_know_is_a_doubt(wheel):
+    run = sv.simulate(*wheel, (0.0, 0.2), sv.Taylor(jets=3), t_eval=np.linspace(0.0, 0.2, 11))
+    rate = run["dreaction_x"]
+    assert "dreaction_x" in run.stored and sv.verify(run.model, run).passed
+    assert sv.verify(run.model, edited(run, stored={"dreaction_x": scaled(rate, 3)})).failures == ("signals",)
+    proof = sv.verify(run.model, edited(run, stored={"mine": rate}))
+    assert proof.verdict == "inconclusive" and "'mine'" in proof.doubts[0]
+
+
 def test_forces_of_a_mechanism_without_a_coupling_fail():
     (model, start, span), (loose, *_) = chain(2.0), chain(1.9)
     run = sv.simulate(model, start, span)

@@ -13,6 +13,7 @@ from collections import Counter, defaultdict
 
 import casadi as ca
 
+from servoctl.codegen.scaling import needed
 from servoctl.jets.pieces import Constant, operand_values
 
 CYCLES = defaultdict(lambda: 40, {  # of today's processors, from the last operand to the value
@@ -44,7 +45,7 @@ def short_chains(statements):
     chains = _Chains(statements)
     for statement in statements:
         chains.take(*statement)
-    return chains.needed()
+    return needed(chains.statements)
 
 
 def time_of(statements):
@@ -182,12 +183,3 @@ class _Chains:
         value = v if scale == 1 else self.product(self.joined_factors((Constant(scale), v)))
         fused = v in self.factors and (v in self.read_once or scale != 1)
         return self.at(value) - (CYCLES[ca.OP_MUL] if fused else 0), value
-
-    def needed(self):
-        """The statements that outputs need."""
-        read, result = set(), []
-        for target, operation, operands in reversed(self.statements):
-            if isinstance(target, str) or target in read:
-                read.update(operand_values(operands))
-                result.append((target, operation, operands))
-        return result[::-1]

@@ -15,7 +15,13 @@ import casadi as ca
 
 from servoctl.jets.pieces import Constant, operand_values
 
+PAIRED = 8  # sums among a sum's factors: of more of them no two are multiplied out together, which takes longest
 ADDED = (0, 1, 2)  # terms by which a sum may grow where another is multiplied out: the fastest result is taken
+NOTHING = ((), 0.0)  # the term of a sum without terms
+_DECIDING = {
+    ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_SIGN, ca.OP_FMIN, ca.OP_FMAX,
+    ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER,
+}  # fmt: skip
 _SIGNS = {ca.OP_ADD: (1.0, 1.0), ca.OP_SUB: (1.0, -1.0), ca.OP_NEG: (-1.0,)}
 _POWERS = {
     ca.OP_MUL: (1.0, (1, 1)), ca.OP_SQ: (1.0, (2,)), ca.OP_TWICE: (2.0, (1,)), ca.OP_DIV: (1.0, (1, -1)),
@@ -36,7 +42,21 @@ def ways(statements):
     list of lists of (target, operation, operands)
         All have the same outputs, to rounding.
     """
-    return [statements, *(_Collected(statements, added).written() for added in ADDED)]
+    return [statements, *(collected(statements, added) for added in ADDED)]
+
+
+def collected(statements, added=0):
+    """The statements with like terms collected, where a sum may grow by `added` terms; see `ways`."""
+    return _Collected(statements, added).written()
+
+
+def _deciding(statements):
+    """The values on which comparisons and other operations with jumps or kinks depend."""
+    result = set()
+    for target, operation, operands in reversed(statements):
+        if target in result or operation in _DECIDING or not isinstance(operation, int):
+            result.update(operand_values(operands))
+    return result
 
 
 def _joined(monomial, other):
@@ -63,13 +83,15 @@ class _Collected:
     """The polynomials {monomial: coefficient} of all values.
 
     `atoms` are numbers of inputs, of functions by (operation, operands), and of sums by their terms; `meaning` has
-    these keys by number, `sums` the polynomials of sums.
+    these keys by number, `sums` the polynomials of sums. What decides between branches keeps its operations, so that
+    paths change at the same instants.
     """
 
     def __init__(self, statements, added):
         self.added, self.atoms, self.meaning, self.sums = added, {}, [], {}
         self.values, self.outputs, self.angles = {}, [], {}
         self.reads = Counter(v for _, _, operands in statements for v in operand_values(operands))
+        self.deciding = _deciding(statements)
         for statement in statements:
             self.take(*statement)
 
@@ -78,6 +100,8 @@ class _Collected:
         given = [self.polynomial(v) for v in operands]
         if isinstance(target, str):
             self.outputs.append((target, given[0]))
+        elif target in self.deciding or operation not in _SIGNS.keys() | _POWERS.keys():
+            self.values[target] = self.of_function(operation, tuple(map(self.term, given)))
         elif operation in _SIGNS:
             terms = Counter()
             for sign, polynomial in zip(_SIGNS[operation], given, strict=True):
@@ -86,17 +110,39 @@ class _Collected:
             shared = self.reads[target] > 1
             value = self.collect(terms)
             self.values[target] = dict([self.term(value)]) if shared else value
-        elif operation in _POWERS:
+        else:
             scale, powers = _POWERS[operation]
             factors = [(m, c, n) for n, (m, c) in zip(powers, map(self.term, given), strict=True)]
             c = scale * math.prod(c**n if c or n > 0 else math.inf for _, c, n in factors)
             self.values[target] = {functools.reduce(_joined, (_power(m, n) for m, _, n in factors)): c}
-        else:
-            terms = tuple(map(self.term, given))
-            atom = self.atom((operation, terms))
-            if operation in (ca.OP_SIN, ca.OP_COS):
-                self.angles.setdefault(terms, {})[operation] = atom
-            self.values[target] = {((atom, 1),): 1.0}
+
+    def of_function(self, operation, terms):
+        """The polynomial of a function of terms (monomial, coefficient).
+
+        What vanishes unless a condition holds has the number of what then holds, and each condition once.
+        """
+        scale = 1.0
+        if operation == ca.OP_IF_ELSE_ZERO:
+            condition, (monomial, scale) = terms
+            if condition in self.conditions(monomial):
+                return {monomial: scale}
+            terms = condition, (monomial, 1.0)
+        atom = self.atom((operation, terms))
+        if operation in (ca.OP_SIN, ca.OP_COS):
+            self.angles.setdefault(terms, {})[operation] = atom
+        return {((atom, 1),): scale}
+
+    def conditions(self, monomial):
+        """The conditions without which an atom vanishes."""
+        key = self.key_of(monomial)
+        if not isinstance(key, tuple) or key[0] != ca.OP_IF_ELSE_ZERO:
+            return []
+        condition, (inner, _) = key[1]
+        return [condition, *self.conditions(inner)]
+
+    def key_of(self, monomial):
+        """The meaning of a monomial that is one atom, to the first power; else None."""
+        return self.meaning[monomial[0][0]] if len(monomial) == 1 and monomial[0][1] == 1 else None
 
     def atom(self, key):
         if key not in self.atoms:
@@ -115,7 +161,7 @@ class _Collected:
     def term(self, polynomial):
         """(monomial, coefficient) of a polynomial, in which a sum is an atom."""
         if len(polynomial) < 2:
-            return next(iter(polynomial.items()), ((), 0.0))
+            return next(iter(polynomial.items()), NOTHING)
         common = _content(polynomial)
         apart = {_joined(m, _power(common, -1)): c for m, c in polynomial.items()}
         sizes = {abs(c) for c in apart.values()}
@@ -130,7 +176,7 @@ class _Collected:
         terms = self.of_one_angle({m: c for m, c in terms.items() if c})
         while True:
             sums = sorted({a for m in terms for a, n in m if n == 1 and a in self.sums})
-            groups = [(a,) for a in sums] + [*itertools.combinations(sums, 2)]
+            groups = [(a,) for a in sums] + [*itertools.combinations(sums, 2)] * (len(sums) <= PAIRED)
             others = (self.multiplied(terms, group) for group in groups)
             best = min((other for other in others if other is not None), key=len, default=terms)
             if best is terms:
@@ -155,9 +201,9 @@ class _Collected:
         return result if len(result) <= most else None
 
     def of_inputs(self, atom):
-        """Whether two terms of a sum are inputs."""
-        single = (m[0] for m in self.sums[atom] if len(m) == 1)
-        return sum(n == 1 and isinstance(self.meaning[a], str) for a, n in single) > 1
+        """Whether two terms of a sum are inputs, or an input and a constant."""
+        single = (m for m in self.sums[atom] if len(m) < 2)
+        return sum(all(n == 1 and isinstance(self.meaning[a], str) for a, n in m) for m in single) > 1
 
     def of_one_angle(self, terms):
         """Terms with 1 - cos²s for sin²s, or the other way round, where these are fewer."""
@@ -218,7 +264,7 @@ class _Writer:
     def polynomial(self, terms):
         """The operand of a polynomial: its common factor, and the factor of most of its terms, are taken out."""
         if len(terms) < 2:
-            return self.term(*next(iter(terms.items()), ((), 0.0)))
+            return self.term(*next(iter(terms.items()), NOTHING))
         common, sizes = _content(terms), {abs(c) for c in terms.values()}
         scale = sizes.pop() if len(sizes) == 1 else 1.0
         if common or scale != 1:

@@ -14,8 +14,9 @@ from itertools import chain, count
 import casadi as ca
 
 from servoctl.codegen.chains import short_chains, time_of
-from servoctl.codegen.collecting import ways
+from servoctl.codegen.collecting import collected, ways
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
+from servoctl.codegen.scaling import is_still, scaled
 from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
 from servoctl.jets.branches import apply_code
 from servoctl.jets.lookup import lookup_at, lookups
@@ -24,8 +25,10 @@ from servoctl.values import frozen
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
+COLLECTED = 4000  # operations: up to here collecting like terms takes at most half a second
 SHARED = 2  # divisions by the same value: from here on they become products with its reciprocal
 PHASES = ("instant", "correction", "rest")  # of t and p alone; for a Newton correction; for the other outputs
+SERIES = ("still", "moving")  # of p alone; all others
 SCALAR_FASTER = '#pragma GCC optimize("no-tree-slp-vectorize")\n'  # pairs of terms of a series cost more to gather
 
 _ARITHMETIC = {
@@ -91,6 +94,8 @@ class Dialect:
         Whether each evaluation waits for the one before: the statements of one chunk are those of `short_chains`.
     collected : bool
         Whether like terms of these are collected before.
+    scaled : bool
+        Whether the statements are those of `scaled`.
     """
 
     number: str = "double"
@@ -103,6 +108,7 @@ class Dialect:
     whole: bool = False
     chained: bool = False
     collected: bool = False
+    scaled: bool = False
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -137,7 +143,8 @@ class Dialect:
 
 
 SCALAR = Dialect(forms=_FORMS_OF_ONE)
-EXACT = Dialect(forms=_FORMS_OF_ONE, exact=True)
+_OF_ZEROS = {"fmin": "({0} <= {1} || {1} != {1} ? {0} : {1})", "fmax": "({0} >= {1} || {1} != {1} ? {0} : {1})"}
+EXACT = Dialect(forms=_FORMS_OF_ONE | _OF_ZEROS, exact=True)  # of 0 and -0 CasADi takes the first, as C need not
 SCALAR_INLINE = Dialect(forms=_FORMS_OF_ONE | {"sin": "s_sin({0})", "cos": "s_cos({0})"})
 SCALAR_CHAINED = replace(SCALAR_INLINE, chained=True, collected=True)
 PORTABLE = Dialect(forms=_FORMS_OF_ONE, linkage="static ")
@@ -230,12 +237,15 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     scalar |= {f"{name}_{key}": other for key, other in (others or {}).items()}
     step = f.numel_in(1) if "newton" in loops else 0
 
-    def emitted(f, name, dialect):
-        return phases(f, name, step, dialect, chunk) if f is phased else function(f, name, dialect, chunk)
+    def emitted(part, name, dialect):
+        if part is phased:
+            return phases(f, name, given, dialect, chunk)
+        return (series if part is f and "taylor" in loops else function)(part, name, dialect, chunk)
 
     phased = f if PHASED.intersection(loops) else None
+    given = None if phased is None else by_phase(f, step)
     parts = [emitted(other, key, dialect) for key, other in scalar.items()]
-    wide = wide and operations(f) <= WIDE
+    wide = wide and (operations(f) if phased is None else sum(map(len, given[0]))) <= WIDE
     if wide:
         parts += [include("lanes.h"), emitted(f, f"{name}_wide", WIDE_LANES)]
     constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
@@ -296,23 +306,62 @@ def function(f, name, dialect=SCALAR, chunk=CHUNK):
     return "".join(tables) + text + dialect.head(name) + f"    {dialect.number} w[{size}];\n" + _calls(names) + "}\n"
 
 
-def phases(f, name, step, dialect=SCALAR, chunk=CHUNK):
-    """C text of one function y = f(t, x, p) in phases, which share a vector w of ``WORK`` numbers.
+def by_phase(f, step):
+    """The statements of a function in each of the `PHASES`, and C texts of their tables.
 
-    ``name_instant`` computes what depends on t and p alone, ``name_correction`` the first `step` outputs, ``name_rest``
-    the others. At one instant, corrections of several x may precede the rest, which completes the last one.
+    Where Newton's method evaluates the first `step` outputs, like terms are collected, if that is faster.
     """
-    statements, tables = _prepared(f, dialect)
-    parts = [_cut(part, chunk) for part in _by_phase(statements, step)]
-    wholes = [f"{name}_{phase}" for phase in PHASES]
+    statements, tables = tabulated(_statements(f, SCALAR))
+    some = [_by_phase(_with_reciprocals(statements), step)]
+    if step and len(statements) <= COLLECTED:
+        some.append(_by_phase(collected(statements), step))
+    return min(some, key=_time_of_newton), tables
+
+
+def _time_of_newton(phases):
+    """The operations of a solution at one instant, after two corrections."""
+    instant, correction, rest = map(len, phases)
+    return instant + 2 * correction + rest
+
+
+def phases(f, name, given, dialect=SCALAR, chunk=CHUNK):
+    """C text of one function y = f(t, x, p) in phases, `given` by `by_phase`, which share a vector w.
+
+    ``name_instant`` computes what depends on t and p alone, ``name_correction`` the step of Newton's method,
+    ``name_rest`` the other outputs. At one instant, corrections of several x may precede the rest, which completes
+    the last one.
+    """
+    statements, tables = given
+    return "".join(_with_lookups(tables, f, dialect)) + _in_phases(name, PHASES, statements, dialect, chunk)
+
+
+def series(f, name, dialect=SCALAR, chunk=CHUNK):
+    """C text of one function y = f(t, x, p) of Taylor coefficients in two phases, which share a vector w.
+
+    ``name_still`` computes what depends on p alone, ``name_moving`` the outputs.
+    """
+    statements, tables = _prepared(f, replace(dialect, scaled=True))
+    still, parts = set(), ([], [])
+    for statement in statements:
+        target, _, operands = statement
+        alone = isinstance(target, int) and all(is_still(v, still) for v in operands)
+        still.update([target] if alone else [])
+        parts[not alone].append(statement)
+    return "".join(tables) + _in_phases(name, SERIES, parts, dialect, chunk)
+
+
+def _in_phases(name, phases, parts, dialect, chunk):
+    """C text of a function in phases, each with its statements, and of the function that calls all of them."""
+    parts = [_cut(part, chunk) for part in parts]
+    wholes = [f"{name}_{phase}" for phase in phases]
     names = [[f"{w}_{k}" for k in range(len(c))] if len(c) > 1 else [w] for w, c in zip(wholes, parts, strict=True)]
     of = [k for k, chunks in enumerate(parts) for _ in chunks]
     text, size = _sharing(list(chain(*names)), list(chain(*parts)), of, dialect)
     static = replace(dialect, linkage="static ")
     for whole, some in zip(wholes, names, strict=True):
         text += static.head(whole, work=True) + _calls(some) + "}\n" if len(some) > 1 else ""
-    all_three = dialect.head(name) + f"    {dialect.number} w[WORK];\n" + _calls(wholes) + "}\n"
-    return f"{''.join(tables)}\n#define WORK {size}\n{text}{all_three}"
+    together = dialect.head(name) + f"    {dialect.number} w[WORK];\n" + _calls(wholes) + "}\n"
+    return f"\n#define WORK {size}\n{text}{together}"
 
 
 def function_of_several(f, name, dialect, suffixes):
@@ -329,13 +378,18 @@ def function_of_several(f, name, dialect, suffixes):
 def _prepared(f, dialect, suffix=""):
     """The statements of a function, with lookups and reciprocals, and C texts of what the lookups need."""
     statements, tables = tabulated(_statements(f, dialect, suffix))
-    tables += [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
-    header = [include("table_lanes.h" if dialect.prefix else "table.h")] if tables else []
     if not dialect.exact:
         chained = dialect.chained and len(statements) <= CHUNK
         some = ways(statements) if chained and dialect.collected else [statements]
+        statements = scaled(statements) if dialect.scaled else statements
         statements = min(map(short_chains, some), key=time_of) if chained else _with_reciprocals(statements)
-    return statements, [*header, *tables]
+    return statements, _with_lookups(tables, f, dialect)
+
+
+def _with_lookups(tables, f, dialect):
+    """C texts of tables and of what the lookups of a function need."""
+    tables = tables + [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
+    return [include("table_lanes.h" if dialect.prefix else "table.h"), *tables] if tables else []
 
 
 def _statements(f, dialect, suffix=""):

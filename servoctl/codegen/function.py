@@ -179,10 +179,10 @@ class Compiled:
         """Number of arithmetic operations of one evaluation."""
         return emit.operations(self.expression)
 
-    @functools.cached_property
+    @property
     def interpreted(self):
         """Evaluation by CasADi, whether or not a library is loaded: a few points do not pay for one."""
-        return Interpreter(self.expression)
+        return self._interpreter
 
     @property
     def backend(self):
@@ -378,19 +378,17 @@ class Compiled:
 
         Returns
         -------
-        x : (n_x, K) array
-            Solutions at the first K times; K < N if the iteration fails at t[K].
-        y : (n_y, K) array
-            Outputs at these times.
+        z : (n_y - pivots, K) array
+            Solutions x at the first K times, dx/dt, d²x/dt² and others; K < N if the iteration fails at t[K].
         iterations : int
             Number of evaluations.
         """
         self._require_loop("newton")
         t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
         nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
-        x, y = np.empty((self.n_x, t.size)), np.empty((self.n_y, t.size))
-        n, iterations = self._library.newton(t, nodes, p, x, y)
-        return x[:, :n], y[:, :n], iterations
+        z = np.empty((self.n_y - self.sizes.get("pivots", 0), t.size))
+        n, iterations = self._library.newton(t, nodes, p, z)
+        return z[:, :n], iterations
 
     def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then pivots.
@@ -433,13 +431,13 @@ class Compiled:
         atol, weights = (atol, None) if isinstance(atol, float) else weighted(atol)
         return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
 
-    def whole(self, start, p, tolerances, most, times, net):
+    def whole(self, start, p, tolerances, most, times, net, judged):
         """A whole motion by the Taylor method in one call, with what shows whether nothing along it needs a decision.
 
         Parameters
         ----------
-        start : (t0, (n_x,) array, t1)
-            Start [s], the state there, and the end [s].
+        start : (t0, (n_x,) array, ends)
+            Start [s], the state there, and the end or the instants (K,) at which steps end [s].
         p : (n_p,) array
         tolerances : (rtol, atol)
             As for `taylor`.
@@ -447,8 +445,11 @@ class Compiled:
             Largest number of steps.
         times : (N,) array
             Samples in the order of the motion [s].
-        net : ((M,) array, float)
-            Where series are compared with the equations: parts of each step, and a distance of instants [s].
+        net : ((M,) array, float, bool)
+            Where series are compared with the equations: parts of each step, and a distance of instants [s]; not at
+            the end if that is a knot.
+        judged : (rtol, atol)
+            Of the states, which judge "invariants".
 
         Returns
         -------
@@ -457,20 +458,20 @@ class Compiled:
             q, γ', ..., γ^(s̄) at the samples, by "settled" if there is one.
         facts : list of arrays
             How far γ^(s̄) of the series is from that of "rates" (n,), the longest step (1,), the largest sizes of the
-            states (n_x,) and, after the start, of "invariants" (m,), the least size of each pivot, 0 where its sign
-            changes, and the largest one, the outputs of "invariants" at the start, and (1,) the largest of them at the
-            end, relative to its gradient times the state.
+            states (n_x,) and, after the start, of "invariants" relative to their tolerances there (m,), the least size
+            of each pivot, 0 where its sign changes, and the largest one, and (1,) the largest of the "invariants" at
+            the end, relative to its gradient times the state.
         None
-            If the steps do not reach the end, or nothing is compiled.
+            If the steps do not reach the end, samples are not finite, or nothing is compiled.
         """
         self._require_loop("taylor")
         self._place(self._library, start[0], start[1], p)
         n, m, sizes = self.sizes["n"], self.sizes["invariants"], self.sizes
         pivots = self.n_y - sizes["last"] * (n + (0 if sizes["plain"] else sizes["nq"]))
-        lengths = n, 1, self.n_x, m, pivots, pivots, m * (1 + self.n_x), 1
+        lengths = n, 1, self.n_x, m, pivots, pivots, 1
         rows = sizes["nq"] + sizes["top"] * n
         times = np.ascontiguousarray(times, dtype=float)
-        found = self._library.whole(start[2], tolerances, most, times, net, (rows, sum(lengths)))
+        found = self._library.whole(start[2], tolerances, most, times, (*net, *judged), (rows, sum(lengths)))
         if found is None:
             return None
         ends = list(itertools.accumulate(lengths, initial=0))
@@ -588,7 +589,8 @@ class Compiled:
         return row_y, run
 
     def _array(self, what, value, shape):
-        array = np.require(np.ascontiguousarray(value, dtype=float), requirements="A")
+        array = np.ascontiguousarray(value, dtype=float)
+        array = array if array.flags.aligned else array.copy()
         if array.shape != shape:
             raise SpecificationError(
                 f"{what} of {self.name!r} has the shape {array.shape}.",

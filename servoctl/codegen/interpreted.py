@@ -40,36 +40,48 @@ class Workspace(threading.local):
         parts = np.split(row, np.cumsum([1, n_x, n_p]))
         run, self._alive = connect(row, parts)
         self.row, self.buffer = (*map(memoryview, parts[:3]), parts[3], run), (*parts, run)
-        self.start, self._log = row[: 1 + n_x + n_p], np.empty((0, 0))
-        self._task = np.zeros(9)  # the Steps of taylor.c: five numbers; addresses of start, log, ends, weights
-        self.task = memoryview(self._task)
-        self._end = np.zeros(1)
-        self.end, self._addresses = memoryview(self._end), memoryview(self._task.view(np.int64))
-        self._addresses[5], self._own = row.ctypes.data, self._end.ctypes.data
-        self.task[0], self._addresses[7], self._ends, self.weights = 1.0, self._own, None, None
-        self.pointer = ctypes.c_void_p(self._task.ctypes.data)
+        self.start = row[: 1 + n_x + n_p]
+        self.steps = StepsOfThread(row, 1 + n_x + n_y)  # an attribute of a thread's own takes as long as three others
 
-    def log(self, rows, columns):
-        """Memory for a log; the next log overwrites it."""
-        if len(self._log) < rows:
-            self._log = np.empty((rows, columns))
-            self._addresses[6] = self._log.ctypes.data
-        return self._log
 
-    def until(self, ends):
-        """Set the end of the steps, or their ends (N,)."""
+class StepsOfThread:
+    """The Steps of taylor.c with their memory: five numbers, and addresses of start, log, ends and weights.
+
+    Parameters
+    ----------
+    start : array
+        t, x and p.
+    columns : int
+        Length of a row of the log.
+    """
+
+    __slots__ = "_address", "_columns", "_end", "_ends", "_memory", "_most", "log", "numbers", "pointer", "weights"
+
+    def __init__(self, start, columns):
+        self._memory = np.zeros(9), np.zeros(1), start
+        task, end, _ = self._memory
+        self.numbers, self._address, self._end = memoryview(task), memoryview(task.view(np.int64)), memoryview(end)
+        self.numbers[0], self._address[5], self._address[7] = 1.0, start.ctypes.data, end.ctypes.data
+        self.pointer = ctypes.c_void_p(task.ctypes.data)
+        self.log, self._columns, self._most, self._ends, self.weights = None, columns, -1, None, None
+
+    def of(self, ends, rtol, atol, every, most, weights):
+        """Set what `Library.taylor` takes; the ends may be a float."""
+        if most > self._most:
+            self.log, self._most = np.empty((most + 1, self._columns)), most
+            self._address[6] = self.log.ctypes.data
+        numbers = self.numbers
+        numbers[1], numbers[2], numbers[3], numbers[4] = rtol, atol, every, most
         if isinstance(ends, float):  # an array's address takes as long as a step
-            self.end[0] = ends
+            self._end[0] = ends
             if self._ends is not None:
-                self.task[0], self._addresses[7], self._ends = 1.0, self._own, None
+                numbers[0], self._address[7], self._ends = 1.0, self._memory[1].ctypes.data, None
         else:
             self._ends = np.atleast_1d(np.ascontiguousarray(ends, dtype=float))
-            self.task[0], self._addresses[7] = self._ends.size, self._ends.ctypes.data
-
-    def weigh(self, weights):
-        """Set the weights of the Taylor method, None for 1."""
-        self.weights = weights  # which must live as long as the call
-        self._addresses[8] = 0 if weights is None else weights.ctypes.data
+            numbers[0], self._address[7] = self._ends.size, self._ends.ctypes.data
+        if weights is not self.weights:
+            self.weights = weights
+            self._address[8] = 0 if weights is None else weights.ctypes.data
 
 
 class Blocks(threading.local):
@@ -293,10 +305,11 @@ class Interpreter:
         return k, path.count
 
     @np.errstate(all="ignore")
-    def newton(self, t, nodes, p, x, y):
-        """Fill columns of x and y; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
+    def newton(self, t, nodes, p, z):
+        """Fill columns of z; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         path, k, alone = self._path(p), 0, 0
-        parts = np.zeros(BLOCK), np.zeros((BLOCK, len(x))), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, len(y)))
+        (_, n_x, _, n_y), rows = self._parts, len(z)
+        parts = np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, n_y))
         call = connected(self._block, parts) if t.size >= BLOCK else None
         forward = nodes[-1, 0] >= nodes[0, 0]
         ends = nodes[1:, 0] if forward else -nodes[1:, 0]
@@ -306,14 +319,14 @@ class Interpreter:
             block = slice(k, k + BLOCK)
             if alone <= k <= t.size - BLOCK:
                 if path.together(t[block], nodes[first[block]], nodes[last[block]], parts, call[0]):
-                    x[:, block], y[:, block] = parts[1].T, parts[3].T
+                    z[:n_x, block], z[n_x:, block] = parts[1].T, parts[3][:, n_x:rows].T
                     k += BLOCK
                     continue
                 alone = k + BLOCK
             point = path.between(t[k], nodes[first[k]], nodes[last[k]])
             if point is None:
                 break
-            x[:, k], y[:, k] = point
+            z[:n_x, k], z[n_x:, k] = point[0], point[1][n_x:rows]
             k += 1
         return k, path.count
 

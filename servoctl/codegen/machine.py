@@ -48,7 +48,7 @@ class Machine:
 
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
-        t, x, p = (np.ascontiguousarray(part) for part in (t, x, p))
+        t, x, p = (np.ascontiguousarray(part, dtype=float) for part in (t, x, p))
         filled = y if y.flags.c_contiguous else np.empty(y.shape)
         work = np.empty((self._rows, TOGETHER))
         arrays = (self._code, self._constants, t, x, p, filled, work)

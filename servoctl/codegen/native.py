@@ -25,7 +25,6 @@ class Library:
         self._library, self._symbol = library, symbol
         self._grid = self.native("grid")
         self._grid.restype = None
-        self._columns = 1 + n_x + n_y
         self.workspace = Workspace(n_x, n_p, n_y, self._connect)
 
     def _connect(self, row, parts):
@@ -34,7 +33,7 @@ class Library:
 
     def native(self, suffix):
         """The C function ``SYMBOL_suffix``."""
-        return self._library[f"{self._symbol}_{suffix}"]
+        return getattr(self._library, f"{self._symbol}_{suffix}")
 
     def grid(self, t, x, p, y):
         """See `Compiled.grid`."""
@@ -59,13 +58,9 @@ class Library:
 
     def taylor(self, ends, rtol, atol, every, max_steps, weights=None):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
-        workspace = self.workspace
-        log, task = workspace.log(max_steps + 1, self._columns), workspace.task
-        workspace.until(ends)
-        if weights is not workspace.weights:
-            workspace.weigh(weights)
-        task[1], task[2], task[3], task[4] = rtol, atol, every, max_steps
-        return log[: self._taylor(workspace.pointer) + 1].copy()
+        steps = self.workspace.steps
+        steps.of(ends, rtol, atol, every, max_steps, weights)
+        return steps.log[: self._taylor(steps.pointer) + 1].copy()
 
     @functools.cached_property
     def _taylor(self):
@@ -73,18 +68,15 @@ class Library:
         run.restype = ctypes.c_int64
         return run
 
-    def whole(self, t1, tolerances, most, times, net, sizes):
+    def whole(self, ends, tolerances, most, times, net, sizes):
         """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
-        workspace, (inside, distance), count = self.workspace, net, len(times)
-        workspace.log(most + 1, self._columns)
-        task = workspace.task
-        workspace.until(float(t1))
-        workspace.weigh(None)
-        (task[1], task[2]), task[3], task[4] = tolerances, 0.0, most
+        task, (inside, distance, to_knot, *judged), count = self.workspace.steps, net, len(times)
+        task.of(ends, *tolerances, 0.0, most, None)
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
-        samples = np.array([count, len(inside), 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
-        samples.view(float)[2] = distance
-        steps = self._whole(workspace.pointer, argument(samples))
+        places = (a.ctypes.data for a in (times, inside, k, jets, facts))
+        samples = np.array([count, len(inside), to_knot, 0, 0, 0, *places])
+        samples.view(float)[3:6] = distance, *judged
+        steps = self._whole(task.pointer, argument(samples))
         return (steps, jets, facts) if steps >= 0 else None
 
     @functools.cached_property
@@ -107,12 +99,12 @@ class Library:
         arrays = map(argument, (cuts, x0, p))
         return run(size, *arrays, ctypes.c_double(longest), most, argument(nodes), ctypes.byref(count)), count.value
 
-    def newton(self, t, nodes, p, x, y):
-        """See `Compiled.newton`."""
+    def newton(self, t, nodes, p, z):
+        """Fill columns of z; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         run, count = self.native("newton"), ctypes.c_int64()
         run.restype = ctypes.c_int64
         sizes = ctypes.c_int64(t.size), ctypes.c_int64(len(nodes))
-        n = run(sizes[0], argument(t), sizes[1], *map(argument, (nodes, p, x, y)), ctypes.byref(count))
+        n = run(sizes[0], argument(t), sizes[1], *map(argument, (nodes, p, z)), ctypes.byref(count))
         return n, count.value
 
 
@@ -141,6 +133,13 @@ def argument(array):
     if array.size and array.flags.carray:  # by its buffer: a quarter of the time of `array.ctypes`
         return ctypes.byref(ctypes.c_char.from_buffer(array))
     return pointer(array)
+
+
+def address(array):
+    """The address of an array's first number, as an int."""
+    if array.size and array.flags.carray:  # by its buffer: a quarter of the time of `array.ctypes`
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+    return array.ctypes.data
 
 
 def pointer(array):

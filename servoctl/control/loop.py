@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 
+from servoctl.codegen.native import address
 from servoctl.errors import ServoError
 from servoctl.values import Value, frozen
 
@@ -76,7 +77,7 @@ class Arguments(ctypes.Structure):
                 continue
             if kind in _TYPES and not isinstance(value, ctypes.c_void_p):
                 self.arrays.append(np.ascontiguousarray(value, dtype=kind))
-                value = self.arrays[-1].ctypes.data
+                value = address(self.arrays[-1])
             setattr(self, name, value)
 
 
@@ -106,8 +107,15 @@ def run_loop(ode, law, loop, advance=None):
     else:
         done, status = _native(native, law, loop, logs)
     if exact:
-        logs["law_x"] = logs["x"][:, loop.measured]
+        logs["law_x"] = _by_columns(logs["x"], loop.measured)
     return status, *(log[:done] for log in logs.values())
+
+
+def _by_columns(x, indices):
+    """Columns of x (N, n_x), without a copy if they are next to each other."""
+    some = indices.tolist()
+    adjoining = some and some == [*range(some[0], some[0] + len(some))]
+    return x[:, some[0] : some[0] + len(some)] if adjoining else x[:, some]
 
 
 def _native(native, law, loop, logs):
@@ -133,14 +141,17 @@ def _native(native, law, loop, logs):
     except KeyboardInterrupt:
         return done, INTERRUPTED
     status = failures[0] if failures else arguments.status
-    return done, _raised(law, loop, done, logs["law_x"]) or status if status == LAW_LOST else status
+    if status != LAW_LOST:
+        return done, status
+    given = logs["law_x"][done] if sizes["stride"] else logs["x"][done, loop.measured]
+    return done, _raised(law, loop, done, given) or status
 
 
-def _raised(law, loop, k, law_x):
-    """The error that a law in C raises in Python at sample k; None if it does not raise."""
-    x, row = law_x[min(k, len(law_x) - 1)], loop.table[min(loop.first + k, len(loop.table) - 1)]
+def _raised(law, loop, k, given):
+    """The error that a law in C raises in Python at sample k, where it is given (n_y + n_z,); None if there is none."""
+    row = loop.table[min(loop.first + k, len(loop.table) - 1)]
     try:
-        law(loop.t0 + k * loop.period, x.copy(), row)
+        law(loop.t0 + k * loop.period, given.copy(), row)
     except ServoError as error:
         return error
 

@@ -17,7 +17,7 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import digits
 from servoctl.plants.plant import Plant
 from servoctl.run import Run, Sampled
-from servoctl.values import Value, frozen
+from servoctl.values import Value, frozen, read_only
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
@@ -71,6 +71,10 @@ class Closed(Sampled, Value):
     success: bool = True
     status: int = 0
     message: str = ""
+
+    def __post_init__(self):
+        for name in ("states", "measurements"):  # which may share their memory
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @cached_property
     def _kinds(self):

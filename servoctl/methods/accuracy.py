@@ -122,7 +122,8 @@ def unlike(levels, largest, sizes=0.0):
 
 def _of_level(levels, largest):
     """The largest of the magnitudes (n_x, ...) of each entry's level."""
-    return np.array([largest[levels == level].max(axis=0) for level in range(levels[-1] + 1)])[levels]
+    first = np.searchsorted(levels, range(levels[-1] + 1))
+    return np.maximum.reduceat(largest, first)[levels]
 
 
 def motion_error(model, jets, reference):

@@ -7,7 +7,7 @@ ends. Samples are solved between the ends of these steps.
 import numpy as np
 
 from servoctl.jets.branches import Branches
-from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch
+from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch, strong
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.watch import Watch
 from servoctl.model.switching import switching
@@ -60,14 +60,18 @@ class _Algebraic(Stepping):
         self.ends = first, first + model.n, first + 2 * model.n
 
     def _levels(self, y):
-        """γ', γ'' and pivots from the outputs of `Equations.path`."""
+        """γ', γ'' and pivots from the outputs of `Equations.path`, or from these with q in place of the Newton step."""
         first, second, end = self.ends
         return y[first:second], y[second:end], y[end:]
 
-    def _split(self, q, y):
-        """State (q, γ'), γ'' and pivots from q and the outputs of `Equations.path`."""
-        rates, top, pivots = self._levels(y)
-        return np.concatenate([q, rates]), top, pivots
+    def _states(self, z):
+        """States (q, γ') from q and further outputs of `Equations.path`."""
+        return np.concatenate([z[: self.model.nq], self._levels(z)[0]])
+
+    def _jets(self, z):
+        """Jets (q, γ', γ'') from q and further outputs of `Equations.path`."""
+        first, _, end = self.ends
+        return z[:end] if first == self.model.nq else np.concatenate([z[: self.model.nq], z[first:end]])
 
     def _pivots_of(self, outputs):
         return self._levels(outputs)[2]
@@ -79,14 +83,36 @@ class _Algebraic(Stepping):
         """Follow the solution from x0 at t0 to t1 [s], and solve at each of the times (N,) [s]."""
         with interruptible(self.motion):
             self._watch(t0, x0, t1)
-            self._start(t0, x0, t1)
             cuts = np.array(breakpoints((t0, t1), knots))
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
+            if self._at_once(cuts, x0, times):
+                return self.motion
+            self._start(t0, x0, t1)
             self.pending, self.resumed, self.motion.room = times, None, len(times)
             t, x = t0, x0
             while t != t1 and self.motion.stop is None and not self.motion.ended:
                 t, x = self._advance(np.append(t, cuts[(cuts - t) * self.direction > 0]), x)
         return self.motion
+
+    def _at_once(self, cuts, x0, times):
+        """Take a motion whose steps and pivots are all in order; False if one of them must be inspected."""
+        if self.family is not None or self.events is not None or len(times) > BLOCK:
+            return False
+        nq = self.model.nq
+        nodes, followed = self.f.continuation(cuts, x0[:nq], self.p, self.longest, NODES)
+        if not 0 < len(nodes) < NODES or nodes[-1, 0] != cuts[-1]:
+            return False
+        outputs = nodes.T[1 + nq :]
+        if not strong(self._levels(outputs)[2], self.model.pivot_sizes):
+            return False
+        z, solved = self.f.newton(times, nodes, self.p)
+        if z.shape[1] < len(times):
+            return False
+        self.motion.fill(self.model, times, self._jets(z))
+        self.motion.start = np.concatenate([nodes[0, 1 : 1 + nq], self._levels(outputs[:, 0])[0]])
+        self.motion.count(iterations=followed + solved, steps=len(nodes) - 1)
+        self.progress(cuts[-1])
+        return True
 
     def _watch(self, t, x, t1):
         """Watch for kinks and switches of the motion, if it has any, with the smooth model that holds at the start.
@@ -109,7 +135,8 @@ class _Algebraic(Stepping):
             self._fail(cuts[0], x, "Newton's method finds no solution of the program from the start")
             return cuts[0], x
         t, nq = nodes[:, 0], self.model.nq
-        states, _, pivots = self._split(nodes[:, 1 : 1 + nq].T, nodes[:, 1 + nq :].T)
+        rates, _, pivots = self._levels(nodes[:, 1 + nq :].T)
+        states = np.concatenate([nodes[:, 1 : 1 + nq].T, rates])
         if self.motion.start is None:
             self.motion.start = states[:, 0]
             self.monitor.begin(pivots[:, 0])
@@ -136,7 +163,7 @@ class _Algebraic(Stepping):
             return None
 
         def states(_, times):
-            found = self._split(*self.f.newton(times, nodes, self.p)[:2])[0]
+            found = self._states(self.f.newton(times, nodes, self.p)[0])
             return np.pad(found, ((0, 0), (0, len(times) - found.shape[1])), constant_values=np.nan)
 
         self.watch.begin(stretch.t[0])
@@ -170,8 +197,7 @@ class _Algebraic(Stepping):
         """Whether a terminal event ends the motion between nodes; the samples up to it are then recorded."""
 
         def solved(t):
-            state, top, _ = self._split(*self.f.newton(t, nodes, self.p)[:2])
-            return np.concatenate([state, top])
+            return self._jets(self.f.newton(t, nodes, self.p)[0])
 
         t = self.events.instants(np.append(nodes[:-1, 0], end))[1]
         jets = solved(t)
@@ -191,10 +217,10 @@ class _Algebraic(Stepping):
         now, self.pending = self.pending[:count], self.pending[count:]
         for first in range(0, count, BLOCK):
             block = now[first : first + BLOCK]
-            q, y, iterations = self.f.newton(block, nodes, self.p)
+            z, iterations = self.f.newton(block, nodes, self.p)
             self.motion.count(iterations=iterations)
-            solved, (rates, top, _) = q.shape[1], self._levels(y)
-            self.motion.add(self.model, block[:solved], q, rates, top)
+            solved = z.shape[1]
+            self.motion.add(self.model, block[:solved], self._jets(z))
             if solved < len(block):
                 return self._fail(block[solved], x, "Newton's method finds no solution of the program there")
             if solved:

@@ -108,6 +108,7 @@ class BulkSteps(Stepping):
         if isinstance(outcome, End) and outcome.error and first and doubts and not outcome.steps:
             return Fine(0), stretch.t[0] + SHORTER * (stretch.t[1] - stretch.t[0])
         return outcome, doubt if isinstance(outcome, Fine) else None
+
     def _retake(self, h):
         """Go on from before a step of length h [s], which is repeated."""
 

@@ -465,11 +465,9 @@ def as_method(value, **settings):
 def default_method(model, drift=None):
     """The method for a model and a treatment of drift if the user names none.
 
-    Series, unless the treatment excludes them, or the equations are so large that making a series takes seconds. A
-    program that determines the velocities, but not all coordinates, is integrated, too.
+    Series, unless the treatment excludes them, or the equations are so large that making a series takes seconds.
     """
-    q = model.reduction.mechanism.q
-    if model.flat and len(q.invariants) == q.nq - q.n:
+    if model.flat:
         return Algebraic()
     series = type(drift) not in Taylor.refused and model.function("ode").operations <= LARGE_FOR_SERIES
     return Automatic() if series else Adaptive()

@@ -8,15 +8,12 @@ there.
 """
 
 import ctypes
-from itertools import pairwise
 
 import numpy as np
 
 from servoctl.codegen.matrices import of_any_size
 from servoctl.codegen.native import pointer
-from servoctl.methods.motion import breakpoints
 from servoctl.methods.taylor import series_loop
-from servoctl.values import frozen
 
 RTOL = 1e-7  # of the steps along which deviations are moved, and of the least size of a level of the state
 NEARBY = 1e-6  # of the size of a state: distance of the states from which deviations are taken
@@ -24,117 +21,8 @@ LEFT_OUT = 1e-3  # of a propagator over a step: its last terms, which bound thos
 MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by the linearisation
 
 
-@frozen
 class Deviations:
-    """How deviations move along a motion, in the sizes of its states.
-
-    Attributes
-    ----------
-    cuts : (N,) array
-        Instants at which steps end, among others [s].
-    start : (f, n_x) array
-        Orthonormal deviations at the first one.
-    log : (K, 1 + f (n_x + f)) array
-        The end of each step [s], the deviations Qᵀ there and R.
-    x : (n_x,) array
-        State at the last one.
-    """
-
-    cuts: np.ndarray
-    start: np.ndarray
-    log: np.ndarray
-    x: np.ndarray
-
-    @property
-    def t(self):
-        """The first instant and the ends of the steps (K + 1,) [s]."""
-        return np.append(self.cuts[0], self.log[:, 0])
-
-    @property
-    def Q(self):
-        """The deviations at these instants, (K + 1, n_x, f)."""
-        end = 1 + self.start.size
-        return np.concatenate([self.start[None], self.log[:, 1:end].reshape(-1, *self.start.shape)]).swapaxes(1, 2)
-
-    @property
-    def R(self):
-        """The propagators of the steps between them, (K, f, f)."""
-        return self.log[:, 1 + self.start.size :].reshape(-1, len(self.start), len(self.start))
-
-    def growth(self, *settings):
-        """ln of the growth between all cuts and the scale of the states, as `growth._growth`; see growth.c.
-
-        Parameters
-        ----------
-        *settings : float
-            Those of growth.c.
-
-        Returns
-        -------
-        logs : (N, N) array
-        scale : (n_x,) array
-            Both are None where propagators are not moderate.
-        """
-        n, (free, n_x) = len(self.cuts), self.start.shape
-        rows, row = 8 * -(-n_x // 8), 8 * -(-free // 8)  # padded to whole vectors
-        sizes = free * (3 * n * free + 4 * row + n * n_x), rows * (free * (free + 2) + n_x + 2), n * (free + 2 * n + 2)
-        settings, work = np.array(settings), np.empty(sum(sizes))
-        logs, scale = np.full((n, n), -np.inf), np.empty(n_x)
-        steps, n_x, n, free = map(ctypes.c_int64, (len(self.log), n_x, n, free))
-        given = steps, n_x, pointer(self.log), n, pointer(self.cuts), pointer(self.start), free
-        found = of_any_size("growth", "growth")(*given, *map(pointer, (settings, work, scale, logs)))
-        return (logs, scale) if found else (None, None)
-
-
-def tangents(model, last, t, x, size):
-    """Orthonormal deviations in the tangent space of the invariants, in the sizes of the states.
-
-    Parameters
-    ----------
-    model : Model
-    last : int
-        As for `deviations`.
-    t : float
-        [s]
-    x : (n_x,) array
-    size : (n_x,) array
-
-    Returns
-    -------
-    (n_x, f) array or None
-        First the unit vectors of states that are not active (`Model.active_states`). None where nothing is compiled,
-        or gradients are dependent or not finite.
-    """
-    call, f = series_loop(model, last).native("tangents"), len(x) - len(model.invariant_names())
-    if call is None:
-        return None
-    call.restype, Q = ctypes.c_int64, np.empty((f, len(x)))
-    return Q.T if call(*_place(model, t, x, size), ctypes.c_int64(f), pointer(Q)) else None
-
-
-def defect(model, last, t, x, size, Q):
-    """How far deviations Q (n_x, f) are from the tangent space at t and x, as `tangents`, in Frobenius' norm."""
-    call, Q, result = series_loop(model, last).native("defect"), np.ascontiguousarray(Q.T), np.empty(1)
-    call.restype = None
-    call(*_place(model, t, x, size), ctypes.c_int64(len(Q)), pointer(Q), pointer(result))
-    return float(result[0])
-
-
-def _place(model, t, x, size):
-    """Pointers to t, x, p, the sizes and the active states; the arrays live as long as they."""
-    arrays = [np.array([t]), x, np.append(model.parameters, t), size, model.active_states]
-    return [_pointer_to(np.ascontiguousarray(array, dtype=float)) for array in arrays]
-
-
-def _pointer_to(array):
-    """`pointer`, which holds its array."""
-    place = pointer(array)
-    place.array = array
-    return place
-
-
-def deviations(model, last, t, x, knots, size, Q, fixed=0):
-    """How deviations move along a motion.
+    """Deviations Q from a motion in the sizes of its states, which move on in C; see deviations.h.
 
     Parameters
     ----------
@@ -142,38 +30,117 @@ def deviations(model, last, t, x, knots, size, Q, fixed=0):
         Without switches.
     last : int
         Highest index of the coefficients, for which they are compiled.
-    t : (N,) array
-        Instants at which steps end, the first and the last one that of the motion [s].
+    cuts : (C,) array
+        Instants at which steps end: the first and the last one of the motion, and those between which paths are smooth
+        [s].
     x : (n_x,) array
         State at the first one.
-    knots : sequence of float
-        Instants at which paths take other branches [s].
     size : (n_x,) array
         Sizes of the states.
-    Q : (n_x, f) array
-        Orthonormal deviations at the first instant.
-    fixed : int
-        The first of them that stay, as nothing depends on the states in them.
+    instants : (N,) array
+        From the first of the cuts on, at which the deviations Z are kept, in which those at the first one have moved on
+        [s].
+
+    Attributes
+    ----------
+    x : (n_x,) array
+        The state after the last step.
+    Q : (f, n_x) array
+        Orthonormal deviations there.
+    Z : (f, n_x, S) array
+        At the instants; S >= N is a whole number of vectors.
+    """
+
+    def __init__(self, model, last, cuts, x, size, instants=()):
+        f, active = series_loop(model, last), model.active_states
+        self.x, self._native = np.array(x), f.native
+        free = len(x) - len(model.invariant_names())
+        self.Q, self.Z = np.empty((free, len(x))), np.empty((free, len(x), padded(len(instants))))
+        settings, self._defect = np.array([RTOL, RTOL * size.min(), NEARBY, LEFT_OUT]), np.empty(1)
+        series = np.empty((free, 1 + f.n_x + f.n_y))
+        given = cuts, instants, np.append(model.parameters, np.nan), settings, size, active
+        self._arrays = [np.ascontiguousarray(array, dtype=float) for array in given]
+        counts = len(cuts), len(instants), len(x) - np.count_nonzero(active), free, MOST_ALONG
+        places = [array.ctypes.data for array in (*self._arrays, self.x, self.Q, self.Z, series)]
+        self._arrays.append(series)
+        self._task = np.array([*counts, *places, 0, self._defect.ctypes.data])
+
+    def begin(self):
+        """Set Q to tangents of the constraints at the first cut, first the unit vectors of states that are not active.
+
+        False where nothing is compiled, or gradients are dependent or not finite.
+        """
+        return self._call("tangents") == 1
+
+    def move(self):
+        """Move to the last cut; False where the series do not reach it, or are too short for the deviations."""
+        return self._call("deviations") >= 0
+
+    def by_step(self):
+        """Move to the last cut; the ends of K steps [s], the deviations there and the propagators over the steps.
+
+        Returns
+        -------
+        t : (K + 1,) array
+            With the first of the cuts.
+        Q : (K + 1, n_x, f) array
+        R : (K, f, f) array
+        None
+            As `move`.
+        """
+        (f, n_x), start = self.Q.shape, self.Q.T.copy()
+        log = np.empty((MOST_ALONG, 1 + f * (n_x + f)))
+        self._task[-2] = log.ctypes.data
+        steps = self._call("deviations")
+        if steps < 0:
+            return None
+        t, Q, R = np.split(log[:steps], [1, 1 + f * n_x], axis=1)
+        Q = np.concatenate([start[None], Q.reshape(steps, f, n_x).swapaxes(1, 2)])
+        return np.append(self._arrays[0][0], t), Q, R.reshape(steps, f, f)
+
+    def defect(self):
+        """How far deviations are from the tangent space at the last cut, in Frobenius' norm; infinite as `begin`."""
+        self._call("defect")
+        return float(self._defect[0])
+
+    def _call(self, name):
+        call = self._native(name)
+        if call is None:
+            return -1
+        call.restype = ctypes.c_int64
+        return call(pointer(self._task))
+
+
+def growth(Z, count, settings):
+    """Whether deviations tell that the internal dynamics of a motion are not unstable; see growth.c.
+
+    Parameters
+    ----------
+    Z : (f, n_x, S) array
+        Of `Deviations`.
+    count : int
+        Number of instants.
+    settings : sequence of float
+        Those of growth.c.
 
     Returns
     -------
-    Deviations or None
-        None where nothing is compiled, or the series do not reach the end or are too short for the deviations.
+    quiet : bool
+    scale : (n_x,) array
+        Of the states.
+    within : (count,) array
+        ln of the largest growth between instants that are at most 0, 1, ... blocks apart.
     """
-    f, forward, (n_x, free) = series_loop(model, last), np.sign(t[-1] - t[0]), Q.shape
-    run, x, start = f.native("deviations"), np.array(x), np.array(Q.T, order="C")
-    if run is None:
-        return None
-    run.restype, moved = ctypes.c_int64, start.copy()
-    settings, size = np.array([RTOL, RTOL * size.min(), NEARBY, LEFT_OUT]), np.ascontiguousarray(size)
-    log, taken = np.empty((MOST_ALONG, 1 + free * (n_x + free))), 0
-    for a, b in pairwise(breakpoints((t[0], t[-1]), knots)):
-        p = np.append(model.parameters, (a + b) / 2)
-        inside = np.concatenate([[a], t[(forward * t > forward * a) & (forward * t < forward * b)], [b]])
-        count, *counts, most = map(ctypes.c_int64, (len(inside), fixed, free, MOST_ALONG - taken))
-        given = (count, *map(pointer, (inside, x, p, settings)), *counts, *map(pointer, (size, moved)))
-        steps = run(*given, most, pointer(log[taken:]))
-        if steps < 0:
-            return None
-        taken += steps
-    return Deviations(np.ascontiguousarray(t), start, log[:taken], x)
+    f, n_x, S = Z.shape
+    of_vectors = n_x**2 + f * n_x * (f + 1) // 2 + (f + 1) * (n_x + 1)
+    others = 8 + n_x * (n_x + 3) + (3 * f + 1) * padded(f)
+    work = np.empty(2 * S * (f * (n_x + f) + count) + 8 * of_vectors + others)
+    settings, scale, within = np.array(settings), np.empty(n_x), np.empty(count)
+    sizes = map(ctypes.c_int64, (count, n_x, f))
+    found = of_any_size("growth", "growth")(*sizes, *map(pointer, (Z, settings, work, scale, within)))
+    return bool(found), scale, within
+
+
+def padded(count):
+    """`PADDED` of orthonormal.h."""
+    return 8 * -(-count // 8)

@@ -160,10 +160,11 @@ def _results(n, n_times, n_x):
 
 def _library(f, model):
     """The C function of a model's series in lanes; None without a compiler."""
-    if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
+    command = compiler.compiler()
+    if command is None:
         return None
     off_manifold = model.once("off the manifold", lambda: _off_manifold(model))
-    return _loaded(f, off_manifold, len(model.state_names), compiler.lanes(), compiler.compiler())
+    return _loaded(f, off_manifold, len(model.state_names), compiler.lanes(), command)
 
 
 @lru_cache(32)
@@ -177,7 +178,7 @@ def _loaded(f, off_manifold, n_x, width, _):
 
 def _plan_library(f, model):
     """The C function of the plans of a model; None without a compiler."""
-    if os.environ.get("SERVOCTL_COMPILER") == "none" or compiler.compiler() is None:
+    if compiler.compiler() is None:
         return None
 
     def text():
@@ -210,7 +211,7 @@ def _source(f, off_manifold, n_x):
     sizes |= {"DEGRADED": DEGRADED, "NEGLIGIBLE": NEGLIGIBLE, "FAR_OFF": FAR_OFF}
     settled = f.others.get("settled")
     sizes |= {} if settled is None else {"SETTLED": ""}
-    expansion = emit.function(f.expression, "expansion", emit.LANES, chunk)  # in one piece values stay in registers
+    expansion = emit.series(f.expression, "expansion", emit.LANES, chunk)  # in one piece values stay in registers
     parts = [emit.unit(sizes), emit.include("lanes.h"), expansion]
     parts += [emit.function(off_manifold.expression, "off_manifold", emit.LANES)]
     parts += [] if settled is None else [emit.function(settled, "servoctl_settled", emit.PORTABLE)]

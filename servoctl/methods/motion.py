@@ -1,8 +1,9 @@
 """What all integrations share: the pieces of a motion, and the change of pivots that the rank monitor requires."""
 
 import contextlib
-import signal
 import threading
+from _signal import SIGINT, getsignal  # `signal` makes enumerations of them, which takes ten times as long
+from _signal import signal as set_signal
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -138,15 +139,15 @@ def interruptible(motion):
 @contextlib.contextmanager
 def without_interruption():
     """Ctrl-C waits until the end; the list is not empty if it came."""
-    pressed, before = [], signal.getsignal(signal.SIGINT)
+    pressed, before = [], getsignal(SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield pressed
         return
-    signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    set_signal(SIGINT, lambda number, frame: pressed.append(number))
     try:
         yield pressed
     finally:
-        signal.signal(signal.SIGINT, before)
+        set_signal(SIGINT, before)
 
 
 def margin_at(t, span):

@@ -37,12 +37,10 @@ def motion_sizes(model, t, x):
 
 def sizes_of(model, inertia, largest, duration):
     """The same from the inertia (n, ...), the largest magnitudes (n_x, ...) of the state and a duration [s]."""
-    metric, levels = np.sqrt(np.maximum(inertia, 0.0)), state_levels(model)
-    sizes, below, duration = largest.copy(), 0.0, max(abs(duration), 1e-300)
-    for level in range(levels.max() + 1):
-        here = levels == level
-        if level == 0 and not model.reduction.mechanism.q.plain:
-            continue
+    metric, n_x = np.sqrt(np.maximum(inertia, 0.0)), len(largest)
+    sizes, below, duration, massive = largest.copy(), 0.0, max(abs(duration), 1e-300), metric > 0
+    for first in range(0 if model.reduction.mechanism.q.plain else model.nq, n_x, model.n):
+        here = slice(first, first + model.n)
         below = np.maximum((metric * largest[here]).max(axis=0), below / duration)
-        sizes[here] = np.where(metric > 0, below / np.where(metric > 0, metric, 1.0), largest[here])
+        np.divide(below, metric, out=sizes[here], where=massive)
     return sizes

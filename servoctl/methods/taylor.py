@@ -15,19 +15,18 @@ import numpy as np
 
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.interpreted import weighted
-from servoctl.errors import SingularProgram
 from servoctl.jets.factors import constants_outside
-from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
+from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
-from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible
+from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import LEAVES, RESOLUTION, End, Tolerance, net, steps_of
+from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
 from servoctl.model.equations import monitored_rows
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
+from servoctl.reduction.ranks import clean, eliminate
 from servoctl.values import frozen
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
@@ -142,69 +141,60 @@ class _Motion(Motion):
         return shifted(self.gamma[level + j][i], level, j)
 
 
-def solved_for(equations):
-    """Velocities that rows determine: for each level below s̄ rows, the entries of γ^(k) they give, and pivots.
-
-    A row of order k or less is linear in γ^(k). Those entries are not integrated: what is integrated satisfies the row
-    with the tolerance, what is solved for to rounding. They are chosen so that all pivots are constant or watched.
-    """
-    r, solved = equations.r, {}
-    for k in range(1, equations.top if r.cascade is None and not equations.definite else 1):
-        rows = [a for a, row in enumerate(r.rows) if row.order + (not row.affine) <= k]
-        matrix = r.leading[rows, :]
-        numbers = clean(*r.points.matrix(matrix))
-        try:
-            order = [(rows.index(i), j) for i, j in r.order if i in rows] or pivot_order(matrix, numbers)
-            columns = sorted(j for _, j in order)
-            order = tuple((i, columns.index(j)) for i, j in order)
-            with noting_dropped() as entries:
-                _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns], order=order)
-        except SingularProgram:
-            continue
-        if rows and not entries and all(_watched(pivot, equations) for pivot in pivots):
-            solved[k] = rows, columns, order
-    return solved
-
-
-def _watched(pivot, equations):
-    """Whether a pivot is constant, or equals one that is watched up to its sign."""
-    others = [other for _, other in equations.all_pivots]
-    return not ca.symvar(pivot) or any(vanish(v) for o in others for v in spread([pivot - o, pivot + o]))
-
-
 class _Rows:
-    """The rows of a reduction along a motion, whose coefficients they give index by index."""
+    """The rows of a reduction along a motion, whose coefficients they give index by index.
+
+    A stage is (rows, columns, pivots): the entries of γ_[k] that some rows give.
+    """
 
     def __init__(self, equations):
         self.r, self.top, self.motion = equations.r, equations.top, _Motion(equations)
-        self.solved, self.groups = solved_for(equations), []
-        for order in sorted({row.order for row in self.r.rows}):
-            members = [a for a, row in enumerate(self.r.rows) if row.order == order]
-            self.groups.append(_Group(self.motion, order, members, [self.r.rows[a].expression for a in members]))
+        self.solved = solved_for(equations)
+        every = range(len(self.r.rows))
+        self.rows, self.leading, self.stages = self.r.rows, self.r.leading, [(every, every, self.r.order)]
+        reduced = in_independent(equations)
+        if reduced:
+            self.rows, self.leading, first = reduced
+            self.stages = [first, self.solved[1]]
+        self.groups = [self._grouped(rows) for rows, _, _ in self.stages]
+
+    def _grouped(self, rows):
+        """Rows by order."""
+        groups = []
+        for order in sorted({self.rows[a].order for a in rows}):
+            members = [a for a in rows if self.rows[a].order == order]
+            groups.append(_Group(self.motion, order, members, [self.rows[a].expression for a in members]))
+        return groups
 
     def advance(self, k):
         """γ_[k]: below s̄ from the state and the rows that determine a part of it, from s̄ on from all rows."""
-        every = range(len(self.r.rows))
-        rows, columns, order = self.solved.get(k, ([], [], ())) if k < self.top else (every, every, ())
-        groups, right = [group for group in self.groups if group.order <= k], {}
+        stages = self.stages if k >= self.top else self._below(k)
         if k:
-            self.motion.guess(k, columns)
-        for group in groups:
-            scale = -factorial(k - group.order) / factorial(k)
-            right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
-        if len(rows):
-            solution = self._solution((list(rows), list(columns)), order, ca.vertcat(*(right[a] for a in rows)))
-            gamma = list(self.motion.gamma[k])
-            for i, x in zip(columns, solution.elements(), strict=True):
-                gamma[i] = 0.0 if x.is_zero() else x
-            self.motion.settle(k, gamma)
+            self.motion.guess(k, [j for _, columns, _ in stages for j in columns])
+        for groups, (rows, columns, order) in zip(self.groups, stages, strict=True):
+            groups, right = [group for group in groups if group.order <= k], {}
             for group in groups:
-                group.correct(k)
+                scale = -factorial(k - group.order) / factorial(k)
+                right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+            if len(rows):
+                self._settle(k, columns, self._solution(rows, columns, order, right))
+                for group in groups:
+                    group.correct(k)
 
-    def _solution(self, place, order, right):
-        if not order:
-            return self.r.solve(right)[0]
-        matrix = self.r.leading[place[0], place[1]]
+    def _below(self, k):
+        """The stages of index k < s̄."""
+        rows, columns, order = self.solved.get(k, ([], [], ()))
+        return [(rows, columns, order)] if len(self.stages) == 1 else [([], [], ()), (rows, columns, order)]
+
+    def _settle(self, k, columns, solution):
+        gamma = list(self.motion.gamma[k])
+        for i, x in zip(columns, solution.elements(), strict=True):
+            gamma[i] = 0.0 if x.is_zero() else x
+        self.motion.settle(k, gamma)
+
+    def _solution(self, rows, columns, order, right):
+        matrix = self.leading[list(rows), list(columns)]
+        right = ca.vertcat(*(right[a] for a in rows))
         return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
 
     def by_rows(self, outputs):
@@ -454,25 +444,24 @@ class TaylorSteps(Stepping):
     def _in_one_call(self, t0, x0, t1, t_eval, knots):
         """Take a motion whose steps, pivots and residuals are all in order; False if one of them must be inspected."""
         model, watched = self.model, (self.family, self.events, arguments(self.model))
-        inside = len(breakpoints((t0, t1), knots)) > 2
-        plain = not (inside or self.every or self.settings.jets) and np.ndim(self.tolerances[1]) == 0
+        plain = not (self.every or self.settings.jets) and np.ndim(self.tolerances[1]) == 0
         if not plain or any(what is not None for what in watched):
             return False
-        p, net = np.append(model.parameters, (t0 + t1) / 2), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT))
-        whole = self.f.whole((t0, x0, t1), p, self.tolerances, self.most, t_eval, net)
+        _, *ends = breakpoints((t0, t1), knots)
+        to_knot = len(knots) > 0 and np.abs(np.subtract(knots, t1)).min() <= margin_at(t1, (t0, t1))
+        p, net = np.append(model.parameters, np.nan), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT), to_knot)
+        task, judged = (t0, x0, ends if len(ends) > 1 else float(t1)), resolved(*self.tolerances)
+        whole = self.f.whole(task, p, self.tolerances, self.most, t_eval, net, judged)
         if whole is None or whole[0] == self.most:
             return False
-        steps, jets, (farthest, longest, states, residuals, least, most, first, drifted) = whole
+        steps, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
         if "settled" not in self.f.others:
             top = self.rates.grid(t_eval, jets[: self.n_x], model.parameters)[self.n_x - self.n : self.n_x]
-            farthest = np.maximum(farthest, np.abs(top - jets[-self.n :]).max(axis=1, initial=0.0))
-            jets[-self.n :] = top
-        if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(jets).all():
+            off = np.abs(top - jets[-self.n :])[:, ~np.isin(t_eval, [*ends[:-1], t1] if to_knot else ends[:-1])]
+            farthest, jets[-self.n :] = np.maximum(farthest, off.max(axis=1, initial=0.0)), top
+        if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(farthest).all():
             return False
-        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any():
-            return False
-        slopes, tolerance = first[len(residuals) :].reshape(self.n_x, -1).T, Tolerance(model, *self.tolerances)
-        if not (residuals <= LEAVES * tolerance.of(slopes[:, :, None], x0[:, None])[:, 0]).all():
+        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any() or not (residuals <= LEAVES).all():
             return False
         self.motion.fill(model, t_eval, jets)
         self.motion.largest, self.motion.drifted = states, float(drifted[0])

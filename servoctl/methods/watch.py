@@ -94,6 +94,11 @@ def net(t, distance, least):
     return k, at, j * least % parts[k] == 0
 
 
+def resolved(rtol, atol):
+    """Tolerances, a number and one or an array, no smaller than rounding of residuals."""
+    return max(rtol, LEAST_RTOL), np.maximum(atol, LEAST_ATOL)
+
+
 class Tolerance:
     """The tolerances of the state along a motion, and of functions of it.
 
@@ -105,8 +110,9 @@ class Tolerance:
     """
 
     def __init__(self, model, rtol, atol):
-        self.levels, self.rtol = state_levels(model), max(rtol, LEAST_RTOL)
-        self.atol = np.broadcast_to(np.maximum(atol, LEAST_ATOL), len(self.levels))[:, None]
+        self.rtol, atol = resolved(rtol, atol)
+        self.levels = state_levels(model)
+        self.atol = np.broadcast_to(atol, len(self.levels))[:, None]
         self.sizes = np.zeros(len(self.levels))
 
     def of(self, slopes, x):

@@ -37,6 +37,7 @@ from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
 from servoctl.reduction.ranks import alive
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
+from servoctl.reduction.samples import warn_of_samples
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
@@ -86,11 +87,14 @@ def derive(
     Warns
     -----
     RuntimeWarning
-        For a residual that is a product and vanishes about the guess by more than one of its factors.
+        For a residual that is a product and vanishes about the guess by more than one of its factors, and for splines
+        whose samples do not determine a derivative of the path that the actuation contains.
     """
     require_parts(mechanism, program, guess)
     model = derived(needed(mechanism, program, keep, guess or {}), program, guess)
-    warn_of_products(model.reduction)
+    r = model.reduction
+    warn_of_products(r)
+    warn_of_samples(r.switches, model.parameters, r.smoothness, r.knots.times)
     return model
 
 
@@ -362,7 +366,7 @@ class Model(Shown):
 
     @property
     def free(self):
-        """The number of free initial values, Σ o_a: the dimension of the internal dynamics."""
+        """The number of free initial values: the dimension of the internal dynamics."""
         return self.reduction.free
 
     @property

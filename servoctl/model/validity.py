@@ -102,11 +102,12 @@ def affirmed_each(model, values):
     if known.function is None or not points:
         return result
     with np.errstate(all="ignore"):
-        at = _points_of(model)
-        if len(result) > 1:  # from the manifold of the model's own parameters others are fewer steps away
-            at = model.rank_points
+        # from the manifold of the model's own parameters others are fewer steps away
+        at = model.rank_points if len(result) > 1 else _points_of(model)
+        if len(result) > 1:
             result = _plainly_valid(model, at, values)
-        for here in _in_parts(np.flatnonzero(~result)):
+        others = np.flatnonzero(~result)
+        for here in (others[first : first + TOGETHER] for first in range(0, len(others), TOGETHER)):
             sets, places = np.unique(values[:, here], axis=1, return_inverse=True)
             moved, t, jets = _moved(model, at, sets)
             good = np.zeros(sets.shape[1], bool)
@@ -114,11 +115,6 @@ def affirmed_each(model, values):
                 good[moved] = _valid(model, known, t, jets, sets[:, moved])
             result[here] = good[places.ravel()]
     return result
-
-
-def _in_parts(cases):
-    """Cases in parts of a size that the memory holds."""
-    return [cases[first : first + TOGETHER] for first in range(0, len(cases), TOGETHER)]
 
 
 def points_with(model):
@@ -153,11 +149,12 @@ def _plainly_valid(model, x, values):
     criterion = model.once(f"criterion {varied}", lambda: _criterion(model, varied))
     if criterion is None:
         return result
-    for here in _in_parts(np.arange(len(result))):
-        count = len(here)
-        at = np.repeat(t, count), np.repeat(x, count, axis=1), np.tile(values[:, here], len(t))
+    for first in range(0, len(result), TOGETHER):
+        part = values[:, first : first + TOGETHER]
+        count = part.shape[1]
+        at = np.repeat(t, count), np.repeat(x, count, axis=1), np.tile(part, len(t))
         met = _evaluated(criterion, *(_on_manifold(model, *at) if moving else at))
-        result[here] = (met > 0).reshape(len(t), count).all(axis=0)
+        result[first : first + count] = (met > 0).reshape(len(t), count).all(axis=0)
     return result
 
 

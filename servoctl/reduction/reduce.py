@@ -93,8 +93,9 @@ class Reduction(Packed):
 
     @property
     def free(self):
-        """The number of free initial values, Σ o_a."""
-        return sum(row.order for row in self.rows)
+        """The number of free initial values: Σ o_a, and coordinates beyond quasi-velocities and their invariants."""
+        q = self.mechanism.q
+        return sum(row.order for row in self.rows) + q.nq - q.n - len(q.invariants)
 
     @property
     def needs(self):

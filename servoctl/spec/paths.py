@@ -202,8 +202,8 @@ def spline(t, times, points, smoothness=2, ends="rest"):
 
     Through more than 200 points, with numbers as times and points, the coefficients are a table, so that samples of a
     measurement may be as many as memory holds. Each point that is an expression costs about 30 operations at every
-    evaluation. Derivatives of samples amplify their rounding: derivative k of samples
-    at a distance h has errors of about 1e-16 (pi/h)^k of their size.
+    evaluation. Derivatives amplify the rounding and noise of samples: an error e of samples at a distance h becomes one
+    of about e (pi/h)^k in derivative k, where e is 1e-16 of their size at least. `derive` warns where this matters.
 
     Parameters
     ----------
@@ -324,7 +324,7 @@ def _by_coefficients(t, times, points, degree, vanishing):
     factors, shapes = _basis(times, degree, vanishing)
     right = ca.vertcat(points, ca.SX(factors.shape[0] - len(times), points.shape[1]))
     lower, upper = (ca.SX(ca.DM(part.sorted_indices())) for part in (factors.L, factors.U))
-    c = ca.solve(upper, ca.solve(lower, right[np.argsort(factors.perm_r).tolist(), :]))
+    c = ca.solve(upper, ca.solve(lower, right[np.argsort(factors.perm_r).tolist(), :]))[factors.perm_c.tolist(), :]
     inside, pieces = _inside(t, times).T, len(times) - 1
     local = [ca.mtimes(inside, c[r : r + pieces, :]) for r in range(degree + 1)]
     return ca.mtimes(ca.vertcat(*local).T, _looked_up(t, times, shapes))

@@ -53,7 +53,7 @@ class Batch(Traced):
 
 def close_many(
     run: Closed, cases: Mapping[str, ArrayLike] | Sequence[Mapping[str, float]], *,
-    scale: Mapping[str, str] | None = None, record: Sequence[str] = (), every: int = 1, threads: int | None = None,
+    scale: Mapping[str, str] | None = None, record: Sequence[str] = (), every: int = 1, executor: int | None = None,
 ) -> Batch:  # fmt: skip
     """Run a closed loop thousands of times, with different numbers in each case.
 
@@ -77,8 +77,9 @@ def close_many(
         States, inputs and residuals ("residual X") to trace.
     every : int
         Traces have every n-th sample.
-    threads : int, optional
-        Default: one per core. There is no executor: disturbances may be functions that no process can be sent.
+    executor : int, optional
+        The number of threads in this process, default: one per core. Unlike `simulate_many` it takes no executor of
+        processes: disturbances may be functions that none can be sent.
 
     Returns
     -------
@@ -102,7 +103,7 @@ def close_many(
     derived = _unit(run)
     traced, every = _traced(record, derived.names, every)
     seeds = _seeds(run.conditions.sensors, len(columns[next(iter(columns))]))
-    threads = threads if threads is None else whole("threads", threads, least=1)
+    threads = executor if executor is None else whole("executor", executor, least=1)
     gathered = None
     if not run.plant.equations.orders:  # else each loop is judged by itself
         step = run.law.step.native("step") if run.law.allocation else None

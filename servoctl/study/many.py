@@ -21,7 +21,7 @@ from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
-from servoctl.simulation import OFF, as_state, simulated
+from servoctl.simulation import OFF, as_state, sample_times, simulated
 from servoctl.study.cases import FAILURE, as_columns
 from servoctl.study.signals import Signals
 from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
@@ -144,7 +144,7 @@ def _share_computed(part, span, method, times):
 
 def _case_table(model, starts, parameters):
     """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
-    columns = {} if parameters is None else as_columns(parameters)
+    columns = {} if parameters is None or isinstance(parameters, dict) and not parameters else as_columns(parameters)
     lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
@@ -167,15 +167,7 @@ def _case_table(model, starts, parameters):
 
 
 def _trace_times(span, t_eval):
-    times = np.unique(as_numbers([] if t_eval is None else t_eval))
-    if times.size and not (np.isfinite(times).all() and min(span) <= times[0] and times[-1] <= max(span)):
-        raise SpecificationError(
-            f"t_eval={repr(t_eval)[:150]} was given.",
-            f"Samples are finite times within t_span, {min(span):g} to {max(span):g} s.",
-            t_eval=t_eval,
-            t_span=span,
-        )
-    return times if span[1] > span[0] else times[::-1]
+    return np.array([]) if t_eval is None or not np.size(t_eval) else sample_times(*span, t_eval, ()).copy()
 
 
 def _with_end(times, span):
@@ -266,7 +258,7 @@ class _Many:
         if ends is None:
             return
         good = (ends[:, 0] > 0) & (ends[:, 3] <= OFF)
-        good &= self._tolerances_fit(span, (x0, p), ends[:, -x0.shape[1] :], method)
+        good &= self._tolerances_fit(span, (x0, p), np.ascontiguousarray(ends[:, -x0.shape[1] :].T), method)
         self._take(which, ends, samples, good)
 
     def plans(self, span, times, threads, progress):
@@ -278,7 +270,9 @@ class _Many:
 
     def _take(self, which, ends, samples, good):
         """Take what was computed for some cases, as far as it is good."""
-        here, n_x = which[good], self.final.shape[1]
+        if good.all():  # as slices, which are no copies
+            good = slice(None)
+        here, n_x = which[good] if len(which) < self.n else good, self.final.shape[1]
         self.done[here], self.steps[here] = True, ends[good, 1]
         self.final[here], self.samples[here] = ends[good, len(OF_A_CASE) :][:, :n_x], samples[good]
 
@@ -299,7 +293,7 @@ class _Many:
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
         which = np.flatnonzero(ready)
-        return which, x[which], p[which]
+        return (which, x, p) if len(which) == self.n else (which, x[which], p[which])
 
     def _started(self, t, x, p):
         """Cases (N,) whose states x (N, n_x) follow for all cases at once; these are set."""
@@ -322,19 +316,24 @@ class _Many:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
-        same_knots = (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
-        return affirmed_each(self.model, p.T.copy()) & same_knots
+        affirmed = affirmed_each(self.model, p.T.copy())
+        if len(of_knots):
+            affirmed &= (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
+        return affirmed
 
     def _tolerances_fit(self, span, cases, largest, method):
-        """Whether motions with magnitudes (N, n_x) need no tolerances of their own, as `simulate` decides it."""
+        """Whether motions with magnitudes (n_x, N) need no tolerances of their own, as `simulate` decides it."""
         default, levels = method.atol is None, state_levels(self.model)
-        fit = (largest.max(axis=1) <= LARGE) | (not default)
-        some = np.flatnonzero(((largest < ATOL / method.rtol) & default).any(axis=1) | unlike(levels, largest.T))
+        fit, doubtful = np.ones(largest.shape[1], bool), unlike(levels, largest)
+        if default:
+            fit = largest.max(axis=0) <= LARGE
+            doubtful |= (largest < ATOL / method.rtol).any(axis=0)
+        some = np.flatnonzero(doubtful)
         if len(some):
             x0, p = (part[some].T for part in cases)
             inertia = self.model.function("matrices").grid(span[0], x0, p)[-self.model.n :]
-            sizes = sizes_of(self.model, inertia, largest[some].T, span[1] - span[0])
-            fit[some] &= ~unlike(levels, largest[some].T, sizes) & ~(coarse(sizes, method.rtol).any(axis=0) & default)
+            sizes = sizes_of(self.model, inertia, largest[:, some], span[1] - span[0])
+            fit[some] &= ~unlike(levels, largest[:, some], sizes) & ~(coarse(sizes, method.rtol).any(axis=0) & default)
         return fit
 
     def one_by_one(self, span, method, times, progress):
@@ -379,7 +378,7 @@ class _Many:
         samples, t = self.samples[finished], _with_end(times, span)
         if len(t) > len(times):
             samples = np.append(samples, self.final[finished, None], axis=1)
-        runs = {i: self.runs[k] for i, k in enumerate(which.tolist()) if k in self.runs}
+        runs = {int(np.searchsorted(which, k)): run for k, run in self.runs.items() if self.done[k]}
         states, p = samples.transpose(2, 1, 0), self.parameters[finished].T
         meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
         trace = Signals(self.model, t, len(times), states, p, level, runs)

@@ -204,13 +204,12 @@ def _clipped(line):
 
 def machine():
     """The machine that computes: processor, cores, system, compiler and versions, as a dict of plain values."""
-    versions = {name: _version(name) for name in ("casadi", "numpy", "scipy")}
     return {
         "processor": _processor(),
-        "cores": os.cpu_count(),
+        "cores": _cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "compiler": compiler() or "none: loops are interpreted",
-        "versions": {"servoctl": __version__, "python": platform.python_version()} | versions,
+        "versions": dict(_versions()),
     }
 
 
@@ -238,8 +237,12 @@ class Traced(Shown):
 
 
 @functools.cache
-def _version(package):
-    return metadata.version(package)
+def _versions():
+    others = {name: metadata.version(name) for name in ("casadi", "numpy", "scipy")}
+    return {"servoctl": __version__, "python": platform.python_version()} | others
+
+
+_cores = functools.cache(os.cpu_count)
 
 
 @functools.cache

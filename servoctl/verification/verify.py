@@ -568,10 +568,13 @@ class _Checks:
             return {}
         worst = 0.0
         for name, values in self.stored.items():
-            if name in self.fresh.names:
+            try:
                 again, values = self.fresh[name], numbers(values, 1)
-                alike = values is not None and values.shape == again.shape
-                worst = max(worst, largest(_ratio(values - again, np.abs(again).max())) if alike else np.inf)
+            except ServoError:
+                self.doubts.append(f"the stored signal {name!r} is none of the model's")
+                continue
+            alike = values is not None and values.shape == again.shape
+            worst = max(worst, largest(_ratio(values - again, np.abs(again).max())) if alike else np.inf)
         return {"signals": worst}
 
     # energy

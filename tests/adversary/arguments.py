@@ -129,7 +129,7 @@ def calls():
         "close disturbance": (lambda force: sv.close(plant, law, x0, span, disturbance={"x": force}), dict(force=1.0)),
         "close start": (lambda value: sv.close(plant, law, {"x": value, "y": 0.0, "dx": 0.0, "dy": 0.0}, span), dict(value=0.1)),
         "close_many": (sv.close_many, dict(run=closed, cases=[{"m": 2.1}], scale=None, record=["x"], every=10,
-                                           threads=1)),
+                                           executor=1)),
         "close_many case": (lambda m: sv.close_many(closed, [{"m": m}]), dict(m=2.1)),
         "limit_report": (sv.limit_report, dict(run=sv.close(bounded, sv.limited(law, bounded), x0, span), scene=None)),
         "fastest": (sv.fastest, dict(mechanism=s["mechanism"], program=s["program"], limits={"pull": 50.0}, t_span=(0.0, 1.0),

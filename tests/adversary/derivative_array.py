@@ -124,6 +124,9 @@ class Reference:
         self.Gm, material_orders = self.leading(self.material)
         self.G_given, self.orders_given = self.leading(self.rows)
         self.top = max([2, *self.orders, *material_orders, *self.orders_given])
+        at = ca.vertcat(self.t, self.q, *self.w)
+        self.at = lambda name, e: ca.Function(name, [at], [e])
+        self.matrices = ca.Function("m", [at], [self.mass, self.E, self.G_given, self.Gm])
         self._equations()
 
     def rate(self, e):
@@ -151,10 +154,12 @@ class Reference:
         if ideal:
             force = ca.SX.sym("lambda", k)
             reaction, unknown = self.G.T @ force, [force, nu]
-        elif redundant:  # u = W⁻¹Pᵀμ = Eᵀy, y = N Gᵀμ, with W = 1
+        elif redundant:  # u = W⁻¹Pᵀμ = Eᵀy, y = N Gᵀμ, with W = 1; any y if u has k effects only, which the rows give
             force, mu, y, z = (ca.SX.sym(name, size) for name, size in (("u", m), ("mu", k), ("y", n), ("z", km)))
-            extra = [force - self.E.T @ y, self.mass @ y + self.Gm.T @ z - self.G.T @ mu, self.Gm @ y]
-            reaction, unknown = self.E @ force, [force, nu, mu, y, z]
+            extra, reaction, unknown = [force - self.E.T @ y, self.Gm @ y], self.E @ force, [force, nu, y]
+            if self.ranks(0.0, np.array(case.guess), np.array(case.speeds)[:, None])["reach"] > k:
+                extra.append(self.mass @ y + self.Gm.T @ z - self.G.T @ mu)
+                unknown += [mu, z]
         else:
             force = ca.SX.sym("u", m)
             reaction, unknown = self.E @ force, [force, nu]
@@ -173,9 +178,6 @@ class Reference:
         self.n_rows, self.n_extra = rows.numel(), sum(e.numel() for e in extra)
         _, made = self.leading(self.material)
         self.row_levels = [0] * n + [1] * n + [-10] * self.n_extra + [order - 1 for order in (*orders, *made)]
-        at = ca.vertcat(self.t, self.q, *self.w)
-        self.at = lambda name, e: ca.Function(name, [at], [e])
-        self.matrices = ca.Function("m", [at], [self.mass, self.E, self.G_given, self.Gm])
 
     def array(self, t, q, w, multipliers):
         """Residuals and Jacobian with respect to all coefficients of q (n, N+2), w (n, N+1), multipliers (p, N)."""

@@ -39,6 +39,7 @@ MENDED = {  # seeds of cases that once ended wrongly, and how they end
     "singular at the start, and the array, too": ("refused rightly", (1002520,)),
     "a pole of the actuation": ("refused rightly", (320344,)),
     "a motion of lower order than its program": ("right", (3000085, 3000545)),
+    "dependent actions beside a material constraint": ("right", (9128,)),
     "reactions that are sums of large terms": ("right", (3001247, 1000962)),
 }
 

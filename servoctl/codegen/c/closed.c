@@ -32,6 +32,14 @@ static void advance(const Loop *c, double t, double h, const double *d, double *
 #include "rk4.h"
 }
 
+/* Whether measurements are neighbouring states as they are, which a law may read where they are logged. */
+static int neighbours(const Loop *c)
+{
+    if (c->stride || c->noise || c->quantum || !c->n_y) return 0;
+    for (int64_t i = 1; i < c->n_y; i++) if (c->measured[i] != c->measured[0] + i) return 0;
+    return 1;
+}
+
 /* The loop; sample k at t0 + k period: measure, call the law, delay, limit, hold. It goes on at a step of a sample, and
    pauses after some steps, as an interruption waits for it. Returns the samples completed. */
 __attribute__((optimize("no-tree-vectorize")))
@@ -39,6 +47,7 @@ int64_t FN(closed)(Step *law, Loop *c)
 {
     double x[NX + 1], p[NP + 1];
     const double h = c->period / (double)c->substeps;
+    const double *const direct = neighbours(c) ? c->x + c->measured[0] : 0;
     int64_t left = c->steps;
     for (int i = 0; i < NX; i++) x[i] = c->state[i];
     for (int i = 0; i < NP; i++) p[i] = c->p[i];
@@ -50,8 +59,8 @@ int64_t FN(closed)(Step *law, Loop *c)
         if (c->step == 0) {
             for (int i = 0; i < NX; i++) if (!isfinite(x[i])) { c->status = 1; return k; }
             for (int i = 0; i < NX; i++) c->x[k * NX + i] = x[i];
-            measure(c, k, x, y);
-            law(t, y, c->table + row * c->n_row, out);
+            if (!direct) measure(c, k, x, y);
+            law(t, direct ? direct + k * NX : y, c->table + row * c->n_row, out);
             for (int64_t i = 0; i < c->n_u + c->n_z; i++) if (!isfinite(out[i])) { c->status = 2; return k; }
             const double *command = k < c->delay ? c->initial_input : out - c->delay * c->n_out;
             const double *before = k ? u - c->n_u : c->initial_input;

@@ -26,9 +26,9 @@ static void series(V powers[5][N][BLOCKS], int64_t terms, V sum[N][BLOCKS])
     V next[N][BLOCKS];
     double factorial = 1; /* terms! / k! */
     for (int k = 2; k < 5; k++) multiplied(powers[1], powers[k - 1], powers[k]);
-    for (int i = 0; i < N; i++) EACH_BLOCK(j) sum[i][j] = powers[0][i][j];
+    for (int i = 0; i < N; i++) EACH_BLOCK(j) next[i][j] = powers[4][i][j];
     for (int64_t term = terms - 4; term >= 0; term -= 4) {
-        multiplied(powers[4], sum, next);
+        if (term < terms - 4) multiplied(powers[4], sum, next);
         for (int k = 3; k >= 0; k--) {
             factorial *= (double)(term + k + 1);
             for (int i = 0; i < N; i++) EACH_BLOCK(j) next[i][j] += factorial * powers[k][i][j];

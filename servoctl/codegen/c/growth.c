@@ -1,38 +1,110 @@
-/* The growth of deviations between all pairs of instants of a motion with n_x states. */
+/* Whether deviations from a motion with n_x states grow as those of unstable internal dynamics do. */
 #include "unit.h"
 #include "orthonormal.h"
+#include "lanes.h"
 
+/* The constants of growth.py. */
 typedef struct {
-    double moderate, sweeps, balanced, tiny, squarings;
+    double moderate, sweeps, balanced, tiny, squarings, unstable, exponential, faster, most_growth, great;
 } Settings;
 
-/* Entry i, j of a triangular matrix (F, F) in a stack. */
-#define AT(stack, k, i, j) (stack)[((k) * F + (i)) * F + (j)]
+/* Matrices at n instants are blocks of matrices of vectors, whose lanes are instants; those beyond n repeat the last one. */
 
-/* C = A B of upper triangular matrices (F, F). */
-static inline void product(int64_t F, const double *A, const double *B, double *C)
+/* Rows of Q (F, n_x) become those of R^-T Q, which are orthonormal, by Gram and Schmidt's process, twice; values that are
+   not finite where they are dependent. */
+static void orthonormal_rows(int64_t F, int64_t n_x, W *Q, W *R)
 {
-    for (int64_t i = 0; i < F; i++) {
-        double *row = C + i * F;
-        for (int64_t j = 0; j < F; j++) row[j] = 0;
-        for (int64_t k = i; k < F; k++) for (int64_t j = k; j < F; j++) row[j] += A[i * F + k] * B[k * F + j];
+    for (int64_t i = 0; i < F * F; i++) R[i] = ALL(0.0);
+    for (int64_t j = 0; j < F; j++) {
+        W *v = Q + j * n_x, square = ALL(0.0), unit;
+        for (int twice = 0; twice < 2; twice++) for (int64_t i = 0; i < j; i++) {
+            W along = ALL(0.0);
+            for (int64_t m = 0; m < n_x; m++) along += Q[i * n_x + m] * v[m];
+            for (int64_t m = 0; m < n_x; m++) v[m] -= along * Q[i * n_x + m];
+            R[i * F + j] += along;
+        }
+        for (int64_t m = 0; m < n_x; m++) square += v[m] * v[m];
+        for (int64_t l = 0; l < W_LANES; l++) R[j * F + j][l] = sqrt(square[l]);
+        unit = 1 / R[j * F + j];
+        for (int64_t m = 0; m < n_x; m++) v[m] *= unit;
     }
 }
 
-/* B = A^-1 of an upper triangular matrix. */
-static inline void inverse(int64_t F, const double *A, double *B)
+/* B = A^-1 of upper triangular matrices. */
+static void inverse(int64_t F, const W *A, W *B)
 {
-    for (int64_t j = 0; j < F; j++) {
-        for (int64_t i = F - 1; i >= 0; i--) {
-            double sum = i == j;
-            for (int64_t k = i + 1; k <= j; k++) sum -= A[i * F + k] * B[k * F + j];
-            B[i * F + j] = i > j ? 0 : sum / A[i * F + i];
+    for (int64_t j = 0; j < F; j++) for (int64_t i = F - 1; i >= 0; i--) {
+        W sum = i == j ? ALL(1.0) : ALL(0.0);
+        for (int64_t k = i + 1; k <= j; k++) sum -= A[i * F + k] * B[k * F + j];
+        B[i * F + j] = i > j ? ALL(0.0) : sum / A[i * F + i];
+    }
+}
+
+/* Whether the products of entries of matrices with those of their inverses stay below a limit. */
+static int moderate(int64_t count, const W *P, const W *inverses, double limit)
+{
+    W most = ALL(0.0), most_inverse = ALL(0.0), sum = ALL(0.0);
+    for (int64_t i = 0; i < count; i++) {
+        most = w_fmax(most, w_fabs(P[i]));
+        most_inverse = w_fmax(most_inverse, w_fabs(inverses[i]));
+        sum += P[i] * 0 + inverses[i] * 0;
+    }
+    double largest = 0, largest_inverse = 0;
+    for (int64_t l = 0; l < W_LANES; l++) {
+        if (sum[l] != 0) return 0; /* one is not finite */
+        largest = fmax(largest, most[l]);
+        largest_inverse = fmax(largest_inverse, most_inverse[l]);
+    }
+    return largest * largest_inverse < limit;
+}
+
+/* Sums over the lanes up to each. */
+static inline W sums_up_to(W a)
+{
+    const W zero = ALL(0.0);
+    for (int64_t apart = 1; apart < W_LANES; apart *= 2) {
+        I from;
+        for (int64_t l = 0; l < W_LANES; l++) from[l] = l < apart ? W_LANES : l - apart;
+        a += __builtin_shuffle(a, zero, from);
+    }
+    return a;
+}
+
+/* The sum of the squares of N(t) Phi(t, s) N(s)' = Z(t) P(s)^-1 Q(s)' over all pairs of instants t >= s, squares (n_x, n_x).
+   work has n_x^2 + F (F + 1) n_x + F n_x vectors. */
+static void sum_of_squares(int64_t n, int64_t F, int64_t n_x, const W *Z, const W *Q, const W *inverses, double *squares,
+                           W *work)
+{
+    W *sums = work, *before = sums + n_x * n_x, *earlier = before + F * (F + 1) / 2 * n_x, *after = earlier + F * n_x;
+    for (int64_t i = 0; i < n_x * n_x + F * (F + 1) / 2 * n_x; i++) sums[i] = ALL(0.0);
+    for (int64_t block = 0; block < PADDED(n); block += W_LANES, Z += F * n_x, Q += F * n_x, inverses += F * F) {
+        W counted, *carried = before;
+        for (int64_t l = 0; l < W_LANES; l++) counted[l] = block + l < n;
+        for (int64_t j = 0; j < F; j++) for (int64_t i = 0; i < n_x; i++) {
+            W sum = ALL(0.0);
+            for (int64_t k = j; k < F; k++) sum += Q[k * n_x + i] * inverses[j * F + k];
+            earlier[j * n_x + i] = sum;
+        }
+        for (int64_t a = 0; a < F; a++) for (int64_t b = a; b < F; b++, carried += n_x) {
+            for (int64_t j = 0; j < n_x; j++) {
+                const W sum = carried[j] + sums_up_to(earlier[a * n_x + j] * earlier[b * n_x + j]);
+                after[j] = sum;
+                carried[j] = ALL(sum[W_LANES - 1]);
+            }
+            for (int64_t i = 0; i < n_x; i++) {
+                const W z = counted * (a == b ? 1.0 : 2.0) * Z[a * n_x + i] * Z[b * n_x + i];
+                for (int64_t j = 0; j < n_x; j++) sums[i * n_x + j] += z * after[j];
+            }
         }
     }
+    for (int64_t i = 0; i < n_x * n_x; i++) {
+        squares[i] = 0;
+        for (int64_t l = 0; l < W_LANES; l++) squares[i] += sums[i][l];
+    }
 }
 
-/* d that makes the sum of W_ij d_j^2/d_i^2 smallest, as `_balance` of growth.py. */
-static void balance(int64_t n_x, const double *W, const Settings *settings, double *scale, double *work)
+/* d that makes the sum of S_ij d_j^2/d_i^2 smallest, as `_balance` of growth.py; work has 3 n_x numbers. */
+static void balance(int64_t n_x, const double *S, const Settings *settings, double *scale, double *work)
 {
     double *square = work, *ratios = work + n_x, *inverses = ratios + n_x;
     for (int64_t i = 0; i < n_x; i++) square[i] = inverses[i] = 1;
@@ -41,8 +113,8 @@ static void balance(int64_t n_x, const double *W, const Settings *settings, doub
         for (int64_t i = 0; i < n_x; i++) {
             double row = 0, column = 0;
             for (int64_t j = 0; j < n_x; j++) {
-                row += W[i * n_x + j] * square[j];
-                column += W[j * n_x + i] * inverses[j];
+                row += S[i * n_x + j] * square[j];
+                column += S[j * n_x + i] * inverses[j];
             }
             row *= inverses[i];
             column *= square[i];
@@ -58,23 +130,57 @@ static void balance(int64_t n_x, const double *W, const Settings *settings, doub
     for (int64_t i = 0; i < n_x; i++) scale[i] = sqrt(square[i]);
 }
 
-/* Rows are padded with zeros to whole vectors, which the compiler adds without looking at their number. */
-#define PADDED(n) (((n) + 7) / 8 * 8)
-static inline void add(int64_t n, double factor, const double *restrict from, double *restrict to)
+/* The entries of matrices at an instant t, W_LANES numbers apart. */
+static inline const double *at(const W *matrices, int64_t F, int64_t t)
 {
-    for (int64_t i = 0; i < n; i += 8) for (int64_t j = 0; j < 8; j++) to[i + j] += factor * from[i + j];
+    return (const double *)(matrices + t / W_LANES * F * F) + t % W_LANES;
 }
 
-/* ln of the norm of an upper triangular Y (F, F), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest
-   eigenvalue F times at most; of a norm below `least` fewer squarings do, as they bound it. work has 3 F PADDED(F). */
-static double log_norm(int64_t F, const double *Y, double squarings, double least, double *work)
+/* Between which the squares of the norms of Y = A(t) B(s) lie, of upper triangular factors, for all s <= t: `least` is the
+   largest sum of squares of a row or column, `most` the sum of all; (n, PADDED(n)). work has F vectors. */
+static void bounds(int64_t n, int64_t F, const W *A, const W *B, double *least, double *most, W *work)
+{
+    for (int64_t t = 0; t < n; t++) for (int64_t s = 0; s <= t; s += W_LANES) {
+        const double *a = at(A, F, t);
+        const W *b = B + s / W_LANES * F * F;
+        W *column = work, largest = ALL(0.0), all = ALL(0.0);
+        for (int64_t j = 0; j < F; j++) column[j] = ALL(0.0);
+        for (int64_t i = 0; i < F; i++) {
+            W row = ALL(0.0);
+            for (int64_t j = i; j < F; j++) {
+                W y = ALL(0.0);
+                for (int64_t k = i; k <= j; k++) y += a[(i * F + k) * W_LANES] * b[k * F + j];
+                row += y * y;
+                column[j] += y * y;
+            }
+            largest = w_fmax(largest, row);
+            all += row;
+        }
+        for (int64_t j = 0; j < F; j++) largest = w_fmax(largest, column[j]);
+        w_store(least + t * PADDED(n) + s, largest);
+        w_store(most + t * PADDED(n) + s, all);
+    }
+}
+
+/* Rows of the length S, padded with zeros. */
+static inline void add(int64_t S, double factor, const double *restrict from, double *restrict to)
+{
+    for (int64_t i = 0; i < S; i += 8) for (int64_t l = i; l < i + 8; l++) to[l] += factor * from[l];
+}
+
+/* ln of the norm of A(t) B(s), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest eigenvalue F times
+   at most; of a norm below `least` fewer squarings do, as they bound it. work has (3 F + 1) PADDED(F) numbers. */
+static double log_norm(int64_t F, const double *A, const double *B, double squarings, double least, double *work)
 {
     const int64_t S = PADDED(F);
-    double *G = work, *square = G + F * S, *rows = square + F * S, result = 0, part = 0.5;
+    double *G = work, *square = G + F * S, *row = square + F * S, result = 0, part = 0.5;
     for (int64_t i = 0; i < F * S; i++) G[i] = 0;
-    for (int64_t k = 0; k < F; k++) {
-        for (int64_t i = 0; i < S; i++) rows[i] = i < F ? Y[k * F + i] : 0;
-        for (int64_t i = k; i < F; i++) add(S, rows[i], rows, G + i * S);
+    for (int64_t i = 0; i < F; i++) {
+        for (int64_t j = 0; j < S; j++) row[j] = 0;
+        for (int64_t k = i; k < F; k++) for (int64_t j = k; j < F; j++) {
+            row[j] += A[(i * F + k) * W_LANES] * B[(k * F + j) * W_LANES];
+        }
+        for (int64_t j = i; j < F; j++) add(S, row[j], row, G + j * S);
     }
     for (int squaring = 0; ; squaring++, part /= 2) {
         double trace = 0;
@@ -82,7 +188,8 @@ static double log_norm(int64_t F, const double *Y, double squarings, double leas
         const double change = part * log(trace); /* after the first, each is less than the square of the one before */
         result += change;
         if (squaring >= squarings || result < least || (squaring && -change < exp2(-squarings) * part)) return result;
-        for (int64_t i = 0; i < F * S; i++) G[i] /= trace;
+        trace = 1 / trace;
+        for (int64_t i = 0; i < F * S; i++) G[i] *= trace;
         for (int64_t i = 0; i < F * S; i++) square[i] = 0;
         for (int64_t i = 0; i < F; i++) for (int64_t k = 0; k < F; k++) add(S, G[i * S + k], G + k * S, square + i * S);
         double *before = G;
@@ -90,132 +197,68 @@ static double log_norm(int64_t F, const double *Y, double squarings, double leas
     }
 }
 
-/* The sum of the squares of N(t) Phi(t, s) N(s)' over all pairs of instants t >= s, W (n_x, n_x). With S = PADDED(n_x),
-   before has F F S numbers, after and earlier have F S, and W has n_x S. */
-static void sum_of_squares(int64_t n, int64_t n_x, int64_t F, const double *Q, const double *P, const double *inverses,
-                           double *before, double *after, double *earlier, double *W)
+/* Whether errors do not grow as those of unstable internal dynamics, from ln of the largest growth between instants that
+   are at most 0, 1, ..., n - 1 blocks apart, within (n): as `_unstable` of growth.py. 0 as well where a single block has
+   growth that it would take apart. */
+static int quiet(int64_t n, int64_t F, const double *within, const Settings *s)
 {
-    const int64_t S = PADDED(n_x);
-    for (int64_t i = 0; i < n_x * S; i++) W[i] = 0;
-    for (int64_t i = 0; i < F * F * S; i++) before[i] = 0;
-    for (int64_t i = 0; i < F * S; i++) after[i] = earlier[i] = 0;
-    for (int64_t t = 0; t < n; t++, Q += F * n_x) {
-        for (int64_t j = 0; j < F; j++) for (int64_t i = 0; i < n_x; i++) {
-            double sum = 0, other = 0;
-            for (int64_t k = 0; k <= j; k++) sum += Q[k * n_x + i] * AT(P, t, k, j);
-            for (int64_t k = j; k < F; k++) other += Q[k * n_x + i] * AT(inverses, t, j, k);
-            after[j * S + i] = sum;
-            earlier[j * S + i] = other;
-        }
-        for (int64_t a = 0; a < F; a++) for (int64_t b = a; b < F; b++) {
-            double *sums = before + (a * F + b) * S, *first = earlier + a * S, *second = earlier + b * S;
-            for (int64_t j = 0; j < S; j++) sums[j] += first[j] * second[j];
-            for (int64_t i = 0; i < n_x; i++) {
-                add(S, (a == b ? 1 : 2) * after[a * S + i] * after[b * S + i], sums, W + i * S);
-            }
-        }
+    const double limit = log(s->unstable), faster = log(s->faster), power = log(2) * (F > 2 ? F - 2 : 0);
+    for (int64_t half = 1; 2 * half < n; half++) {
+        const double whole = within[2 * half], more = whole - within[half];
+        if (!(whole > s->exponential * within[half] || more > faster + power)) continue;
+        if (whole > s->most_growth * within[n - 1] && whole > limit && more > faster) return 0;
     }
-    for (int64_t i = 0; i < n_x; i++) for (int64_t j = 0; j < n_x; j++) W[i * n_x + j] = W[i * S + j];
+    return within[n - 1] <= log(s->great) && within[1] <= limit;
 }
 
-/* Propagators P from the first instant to each of the n cuts, and the deviations there, from the log of `deviations`. */
-static void from_the_start(int64_t steps, int64_t n_x, const double *row, int64_t n, const double *cuts,
-                           const double *Q, int64_t F, double *P, double *corners, double *work)
+/* Whether deviations Z (F, n_x, PADDED(n)) from a motion at n instants, those at the first of them moved on, tell that its
+   internal dynamics are not unstable. Growth is that of the states x_i/scale_i; `within` is as for `quiet`, where all other
+   growth is less. 0 as well beyond moderate propagators, of which products with inverses lose digits. work has the numbers
+   of W_LANES + 2 n PADDED(n) + 2 PADDED(n) F (n_x + F) + n_x (n_x + 3) + 3 F PADDED(F) + PADDED(F)
+   + W_LANES (n_x^2 + F n_x (F + 1)/2 + (F + 1) (n_x + 1)). */
+int64_t FN(growth)(int64_t n, int64_t n_x, int64_t F, const double *Z, const Settings *settings, double *work,
+                   double *scale, double *within)
 {
-    for (int64_t i = 0; i < F * F; i++) P[i] = i % (F + 1) == 0;
-    for (int64_t i = 0; i < F * n_x; i++) corners[i] = Q[i];
-    for (int64_t i = 0; i < F * F; i++) work[i] = P[i];
-    for (int64_t step = 0, k = 1; step < steps && k < n; step++, row += 1 + F * (n_x + F)) {
-        double *next = P + k * F * F;
-        product(F, row + 1 + F * n_x, work, next);
-        for (int64_t i = 0; i < F * F; i++) work[i] = next[i];
-        if (row[0] != cuts[k]) continue;
-        for (int64_t i = 0; i < F * n_x; i++) corners[k * F * n_x + i] = row[1 + i];
-        k++;
-    }
-}
-
-/* Whether the products of entries of n matrices with those of their inverses stay below a limit. */
-static int moderate(int64_t n, int64_t F, const double *P, const double *inverses, double limit)
-{
-    double most = 0, most_inverse = 0;
-    for (int64_t i = 0; i < n * F * F; i++) {
-        if (!isfinite(P[i]) || !isfinite(inverses[i])) return 0;
-        most = fmax(most, fabs(P[i]));
-        most_inverse = fmax(most_inverse, fabs(inverses[i]));
-    }
-    return most * most_inverse < limit;
-}
-
-/* Between which the squares of the norms of Y = A(t) B(s) lie, of upper triangular factors, for all s <= t: `least` is the
-   largest sum of squares of a row or column, `most` the sum of all; (n, n). work has n F^2 + n F + 2 n numbers. */
-static void bounds(int64_t n, int64_t F, const double *A, const double *B, double *least, double *most, double *work)
-{
-    double *by_instant = work, *columns = by_instant + n * F * F, *row = columns + n * F, *y = row + n;
-    for (int64_t s = 0; s < n; s++) for (int64_t i = 0; i < F * F; i++) by_instant[i * n + s] = B[s * F * F + i];
-    for (int64_t t = 0; t < n; t++, least += n, most += n) {
-        for (int64_t s = 0; s <= t; s++) least[s] = most[s] = 0;
-        for (int64_t i = 0; i < n * F; i++) columns[i] = 0;
-        for (int64_t i = 0; i < F; i++) {
-            for (int64_t s = 0; s <= t; s++) row[s] = 0;
-            for (int64_t j = i; j < F; j++) {
-                for (int64_t s = 0; s <= t; s++) y[s] = 0;
-                for (int64_t k = i; k <= j; k++) {
-                    const double a = AT(A, t, i, k), *b = by_instant + (k * F + j) * n;
-                    for (int64_t s = 0; s <= t; s++) y[s] += a * b[s];
-                }
-                double *column = columns + j * n;
-                for (int64_t s = 0; s <= t; s++) row[s] += y[s] * y[s];
-                for (int64_t s = 0; s <= t; s++) column[s] += y[s] * y[s];
-            }
-            for (int64_t s = 0; s <= t; s++) most[s] += row[s];
-            for (int64_t s = 0; s <= t; s++) least[s] = row[s] > least[s] ? row[s] : least[s];
-        }
-        for (int64_t j = 0; j < F; j++) {
-            const double *column = columns + j * n;
-            for (int64_t s = 0; s <= t; s++) least[s] = column[s] > least[s] ? column[s] : least[s];
-        }
-    }
-}
-
-/* ln of the growth between the n cuts of `deviations`, (n, n), from its log, and the scale of the states: as `_growth` of
-   growth.py. Q are the deviations at the first cut. A pair of which the growth is less than between two that are no
-   farther apart is left out. Returns 0 beyond moderate propagators, of which products with inverses lose digits.
-   With S = PADDED(n_x),
-   work has 3 n F^2 + 4 F PADDED(F) + n n_x F + n F + 2 n (n + 1) + S (F^2 + 2 F + 2 + n_x) numbers. */
-int64_t FN(growth)(int64_t steps, int64_t n_x, const double *log_of_steps, int64_t n, const double *cuts,
-                   const double *Q, int64_t F, const Settings *settings, double *work, double *scale, double *logs)
-{
-    const int64_t S = PADDED(n_x);
-    double *P = work, *inverses = P + n * F * F, *pair = inverses + n * F * F, *before = pair + 4 * F * PADDED(F);
-    double *corners = before + S * F * F, *least = corners + n * F * n_x, *most = least + n * n, best = 0;
-    double *after = most + n * n + n * F * F + n * F + 2 * n, *earlier = after + S * (F + 2), *W = earlier + S * F;
+    const int64_t S = PADDED(n), blocks = S / W_LANES, all = F * n_x;
+    W *whole = (W *)(((uintptr_t)work + sizeof(W) - 1) / sizeof(W) * sizeof(W)), *Q = whole + blocks * all;
+    W *P = Q + blocks * all, *inverses = P + blocks * F * F, *rest = inverses + blocks * F * F;
+    double *least = (double *)(rest + n_x * n_x + all * (F + 1) / 2 + (F + 1) * (n_x + 1)), *most = least + n * S;
+    double *squares = most + n * S, *of_pair = squares + n_x * (n_x + 3), best = 1;
     const double least_part = exp2(-settings->squarings) * log((double)F);
-    from_the_start(steps, n_x, log_of_steps, n, cuts, Q, F, P, corners, pair);
-    for (int64_t k = 0; k < n; k++) inverse(F, P + k * F * F, inverses + k * F * F);
-    if (!moderate(n, F, P, inverses, settings->moderate)) return 0;
-    sum_of_squares(n, n_x, F, corners, P, inverses, before, after, earlier, W);
-    balance(n_x, W, settings, scale, after);
-    for (int64_t k = 0; k < n; k++) {
-        double *columns = corners + k * F * n_x;
-        for (int64_t i = 0; i < F * n_x; i++) columns[i] /= scale[i % n_x];
-        if (!orthonormal(F, n_x, columns, pair)) return 0;
-        product(F, pair, P + k * F * F, pair + F * F);
-        for (int64_t i = 0; i < F * F; i++) P[k * F * F + i] = pair[F * F + i];
+    for (int64_t block = 0; block < blocks; block++) for (int64_t e = 0; e < all; e++) {
+        W *z = whole + block * all + e;
+        for (int64_t l = 0, t = block * W_LANES; l < W_LANES; l++, t++) (*z)[l] = Z[e * S + (t < n ? t : n - 1)];
+        Q[block * all + e] = *z;
+    }
+    for (int64_t k = 0; k < blocks; k++) {
+        orthonormal_rows(F, n_x, Q + k * all, P + k * F * F);
         inverse(F, P + k * F * F, inverses + k * F * F);
     }
-    bounds(n, F, P, inverses, least, most, most + n * n);
-    for (int64_t apart = 0; apart < n; apart++) {
-        for (int64_t t = apart; t < n; t++) best = fmax(best, least[t * n + t - apart]);
-        for (int64_t s = 0, t = apart; t < n; s++, t++) {
-            double *result = logs + s * n + t;
-            if (least[t * n + s] >= best) *result = log(fmax(best, settings->tiny)) / 2;
-            if (!(most[t * n + s] > best) || !(most[t * n + s] > settings->tiny)) continue;
-            const double log_best = log(fmax(best, settings->tiny)) / 2;
-            product(F, P + t * F * F, inverses + s * F * F, pair);
-            *result = log_norm(F, pair, settings->squarings, log_best, pair + F * F);
-            best = fmax(best, exp(2 * *result - least_part));
+    if (!moderate(blocks * F * F, P, inverses, settings->moderate)) return 0;
+    sum_of_squares(n, F, n_x, whole, Q, inverses, squares, rest);
+    balance(n_x, squares, settings, scale, squares + n_x * n_x);
+    for (int64_t k = 0; k < blocks; k++) {
+        for (int64_t e = 0; e < all; e++) Q[k * all + e] = whole[k * all + e] / scale[e % n_x];
+        orthonormal_rows(F, n_x, Q + k * all, P + k * F * F);
+        inverse(F, P + k * F * F, inverses + k * F * F);
+    }
+    bounds(n, F, P, inverses, least, most, rest);
+    within[0] = 0;
+    for (int64_t apart = 1; apart < n; apart++) {
+        int64_t first = apart;
+        for (int64_t t = apart; t < n; t++) {
+            best = fmax(best, least[t * S + t - apart]);
+            first = most[t * S + t - apart] > most[first * S + first - apart] ? t : first;
+        }
+        within[apart] = fmax(within[apart - 1], log(best) / 2);
+        for (int64_t k = apart - 1; k < n; k++) {
+            const int64_t t = k < apart ? first : k, s = t - apart; /* the one that may be largest comes first */
+            if (!(most[t * S + s] > best) || k == first) continue;
+            const double *a = at(P, F, t), *b = at(inverses, F, s);
+            const double found = log_norm(F, a, b, settings->squarings, log(best) / 2, of_pair);
+            within[apart] = fmax(within[apart], found);
+            best = fmax(best, exp(2 * found - least_part));
         }
     }
-    return 1;
+    return quiet(n, F, within, settings);
 }

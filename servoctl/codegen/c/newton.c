@@ -175,29 +175,28 @@ static inline W gather(const double *const *node, int64_t offset)
     return value;
 }
 
-/* The largest |delta_i| / (1 + |x_i|) of eight points. */
-static inline double wide_relative(const W *x, const W *y)
+/* The largest |delta_i| * size_i of each of eight points; NaN where one is none. */
+static inline W wide_relative(const W *size, const W *delta)
 {
-    double defect = 0;
     W largest = ALL(0.0);
-    for (int64_t i = 0; i < NX; i++) {
-        const W e = w_fabs(y[i]) / (1.0 + w_fabs(x[i]));
-        largest = w_select((e <= largest) | (largest != largest), largest, e);
-    }
-    for (int64_t l = 0; l < 8; l++) {
-        if (!isfinite(largest[l])) return INFINITY;
-        defect = fmax(defect, largest[l]);
-    }
-    return defect;
+    for (int64_t i = 0; i < NX; i++) largest = w_larger_size(w_fabs(delta[i] * size[i]), largest);
+    return largest;
+}
+
+static double largest_of(W a)
+{
+    double largest = a[0];
+    for (int64_t l = 1; l < 8; l++) largest = fmax(largest, a[l]);
+    return largest;
 }
 
 /* The solutions at the eight times from t[k] on, each between the nodes a and b: as `point` predicts them, corrected
-   together, by the first outputs alone until the correction is small. Returns 1 if all converge; then the logs hold
+   together, by the first outputs alone until the correction is small. Returns 1 if all converge; then the log holds
    them. */
 static int block(int64_t n, int64_t k, const double *t, const double *const *a, const double *const *b, double allowed,
-                 const W *p, double *x_log, double *y_log, int64_t *count)
+                 const W *p, double *log, int64_t *count)
 {
-    W x[NX + 1], y[NY + 1], w[WORK];
+    W x[NX + 1], y[NY + 1], w[WORK], size[NX + 1], defect;
     const W now = w_load(t + k), start = gather(a, 0), h = gather(b, 0) - start;
     const W s = (now - start) / h, r = 1.0 - s, s3 = s * s * s, r3 = r * r * r;
     const W at_a = r3 * (1.0 + s * (3.0 + 6.0 * s)), rate_a = r3 * s * (1.0 + 3.0 * s) * h;
@@ -206,32 +205,34 @@ static int block(int64_t n, int64_t k, const double *t, const double *const *a, 
     for (int64_t i = 0; i < NX; i++)
         x[i] = at_a * gather(a, 1 + i) + rate_a * gather(a, 1 + 2 * NX + i) + second_a * gather(a, 1 + 3 * NX + i)
              + at_b * gather(b, 1 + i) - rate_b * gather(b, 1 + 2 * NX + i) + second_b * gather(b, 1 + 3 * NX + i);
+    for (int64_t i = 0; i < NX; i++) size[i] = 1.0 / (1.0 + w_fabs(x[i]));
     FN(wide_instant)(now, x, p, y, w);
-    for (double defect = INFINITY, before = allowed; !(defect <= QUADRATIC); before = CONTRACTION * defect) {
+    for (double before = allowed; ; before = CONTRACTION * largest_of(defect)) {
         FN(wide_correction)(now, x, p, y, w);
         *count += 8;
-        defect = wide_relative(x, y);
-        if (!(defect <= before)) return 0;
+        defect = wide_relative(size, y);
+        if (w_any(~(defect <= before))) return 0;
         for (int64_t i = 0; i < NX; i++) x[i] += y[i];
+        if (!w_any(defect > QUADRATIC)) break;
     }
     FN(wide_correction)(now, x, p, y, w);
     *count += 8;
-    if (!(wide_relative(x, y) <= CORRECTED)) return 0;
+    if (w_any(~(wide_relative(size, y) <= CORRECTED))) return 0;
     FN(wide_rest)(now, x, p, y, w);
     for (int64_t i = NY - PIVOTS; i < NY; i++) {
         const W other = gather(a, 1 + NX + i), product = y[i] * other;
         if (w_any(~((product >= STEADY * y[i] * y[i]) & (product >= STEADY * other * other)))) return 0;
     }
-    for (int64_t i = 0; i < NX; i++) w_store(x_log + i * n + k, x[i]);
-    for (int64_t i = 0; i < NY; i++) w_store(y_log + i * n + k, y[i]);
+    for (int64_t i = 0; i < NX; i++) w_store(log + i * n + k, x[i]);
+    for (int64_t i = NX; i < NY - PIVOTS; i++) w_store(log + i * n + k, y[i]);
     return 1;
 }
 #endif
 
-/* The solution at each of n times, in the order of the nodes; the logs hold n columns. Returns the number of points
-   solved. */
-int64_t FN(newton)(int64_t n, const double *t, int64_t n_nodes, const double *nodes, const double *p, double *x_log,
-                   double *y_log, int64_t *count)
+/* The solution at each of n times, in the order of the nodes; the log holds n columns of x and of the outputs after
+   delta, without pivots. Returns the number of points solved. */
+int64_t FN(newton)(int64_t n, const double *t, int64_t n_nodes, const double *nodes, const double *p, double *log,
+                   int64_t *count)
 {
     double x[NX + 1], y[NY + 1];
     const double *a = nodes, *const last = nodes + NODE * (n_nodes - 1), *const final = n_nodes > 1 ? last - NODE : last;
@@ -256,7 +257,7 @@ int64_t FN(newton)(int64_t n, const double *t, int64_t n_nodes, const double *no
                 }
                 to[l] = from[l] + NODE;
             }
-            if (block(n, k, t, from, to, allowed, wide_p, x_log, y_log, count)) {
+            if (block(n, k, t, from, to, allowed, wide_p, log, count)) {
                 k += 7;
                 continue;
             }
@@ -264,8 +265,8 @@ int64_t FN(newton)(int64_t n, const double *t, int64_t n_nodes, const double *no
         }
 #endif
         if (!point(t[k], a, a == last ? a : a + NODE, p, x, y, count)) return k;
-        for (int64_t i = 0; i < NX; i++) x_log[i * n + k] = x[i];
-        for (int64_t i = 0; i < NY; i++) y_log[i * n + k] = y[i];
+        for (int64_t i = 0; i < NX; i++) log[i * n + k] = x[i];
+        for (int64_t i = NX; i < NY - PIVOTS; i++) log[i * n + k] = y[i];
     }
     return n;
 }

@@ -4,6 +4,8 @@
 
 #include "unit.h"
 
+#define PADDED(n) (((n) + 7) / 8 * 8) /* to whole vectors */
+
 /* Columns Q (F, n) become Q R^-1 with Q'Q = 1, by Gram and Schmidt's process, twice; 0 where they are dependent. */
 static int orthonormal(int64_t F, int64_t n, double *Q, double *R)
 {
@@ -25,6 +27,15 @@ static int orthonormal(int64_t F, int64_t n, double *Q, double *R)
         R[j * F + j] = size;
     }
     return 1;
+}
+
+/* C = A B of upper triangular matrices (F, F). */
+static void triangular_product(int64_t F, const double *A, const double *B, double *C)
+{
+    for (int64_t i = 0; i < F * F; i++) C[i] = 0;
+    for (int64_t i = 0; i < F; i++) for (int64_t k = i; k < F; k++) for (int64_t j = k; j < F; j++) {
+        C[i * F + j] += A[i * F + k] * B[k * F + j];
+    }
 }
 
 #endif

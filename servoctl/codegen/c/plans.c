@@ -9,7 +9,7 @@
 #endif
 
 #define STATE (NX + N)
-#define FIRST (PLAIN ? NX : 3 * NX) /* of the velocities among the outputs */
+#define FIRST (PLAIN ? NX : 3 * NX) /* of the velocities in the log */
 
 /* Whether a pivot of some nodes is far below or above its largest size so far. */
 static int pivots_fall(const Many *m, int64_t n, const double *nodes)
@@ -25,8 +25,8 @@ static int pivots_fall(const Many *m, int64_t n, const double *nodes)
     return 0;
 }
 
-/* A case, and its number of nodes; the nodes, x and y are memory for its path and samples. */
-static int64_t plan(const Many *m, int64_t at, double *nodes, double *x, double *y)
+/* A case, and its number of nodes; the nodes and the log are memory for its path and samples. */
+static int64_t plan(const Many *m, int64_t at, double *nodes, double *log)
 {
     const double *p = m->p + at * NP;
     double *row = m->ends + at * (RESULTS + 2 * STATE), *samples = m->samples + at * m->n_times * STATE;
@@ -37,13 +37,13 @@ static int64_t plan(const Many *m, int64_t at, double *nodes, double *x, double 
     row[0] = PIVOT_FALLS;
     if (pivots_fall(m, n, nodes)) return n;
     row[0] = STUCK;
-    if (FN(newton)(m->n_times, m->times, n, nodes, p, x, y, &count) != m->n_times) return n;
+    if (FN(newton)(m->n_times, m->times, n, nodes, p, log, &count) != m->n_times) return n;
     row[0] = FINISHED;
     row[1] = (double)(n - 1);
     row[2] = m->t1;
     for (int64_t k = 0; k < m->n_times; k++, samples += STATE) {
-        for (int64_t i = 0; i < NX; i++) samples[i] = x[i * m->n_times + k];
-        for (int64_t i = 0; i < N; i++) samples[NX + i] = y[(FIRST + i) * m->n_times + k];
+        for (int64_t i = 0; i < NX; i++) samples[i] = log[i * m->n_times + k];
+        for (int64_t i = 0; i < N; i++) samples[NX + i] = log[(FIRST + i) * m->n_times + k];
     }
     return n;
 }
@@ -52,11 +52,10 @@ static int64_t plan(const Many *m, int64_t at, double *nodes, double *x, double 
 void FN(plans)(Many *m)
 {
     double *nodes = malloc(sizeof(double) * (size_t)(m->max_steps * NODE));
-    double *x = malloc(sizeof(double) * (size_t)(m->n_times * NX)), *y = malloc(sizeof(double) * (size_t)(m->n_times * NY));
-    for (int64_t at, steps = 0; nodes && x && y && steps < m->most && !stopped(m) && (at = next_case(m)) >= 0;) {
-        steps += plan(m, at, nodes, x, y) + m->n_times;
+    double *log = malloc(sizeof(double) * (size_t)(m->n_times * (NY - PIVOTS)));
+    for (int64_t at, steps = 0; nodes && log && steps < m->most && !stopped(m) && (at = next_case(m)) >= 0;) {
+        steps += plan(m, at, nodes, log) + m->n_times;
     }
     free(nodes);
-    free(x);
-    free(y);
+    free(log);
 }

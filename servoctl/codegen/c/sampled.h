@@ -8,7 +8,7 @@ typedef struct {
     int64_t samples, substeps, delay, n_y, n_z, n_u, n_out, n_row, rows, first, n_d, at_u; /* of any loop */
     int64_t depth, every, n_traced, columns, stop;                                         /* of many */
     int64_t status, sample, step, steps; /* of one: how it ended, where it goes on, integration steps until it pauses */
-    int64_t stride;                      /* numbers from a row of law_x to the next; 0 where only the last is needed */
+    int64_t stride;                      /* numbers from a row of law_x to the next; 0 where it follows from x */
     double t0, period;
     const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *initial_input, *disturbance;
     const double *constants, *scale, *deviations;

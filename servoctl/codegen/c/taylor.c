@@ -97,9 +97,10 @@ int64_t FN(taylor)(const Steps *s)
     const double log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, *end = s->ends;
     const double *last = end + (int64_t)s->count - 1;
     const int64_t max_steps = (int64_t)s->max_steps, project_every = (int64_t)s->project_every;
-    double t = s->start[0], t1 = *end, *log = s->log, p[NP];
+    double t = s->start[0], t1 = *end, *log = s->log, p[NP], work[WORK];
     for (int64_t i = 0; i < NX; i++) log[1 + i] = s->start[1 + i];
     on_branch(s->start + 1 + NX, (t + t1) / 2, p);
+    FN(still)(t, log + 1, p, 0, work);
     for (int64_t step = 0; ; step++) {
         double *x = log + 1, *y = x + NX, *row = y + NY, *x_next = row + 1;
         log[0] = t;
@@ -110,8 +111,9 @@ int64_t FN(taylor)(const Steps *s)
         if (t == t1) {
             t1 = *++end;
             p[NP - 1] = (t + t1) / 2;
+            FN(still)(t, x, p, 0, work);
         }
-        NAME(t, x, p, y);
+        FN(moving)(t, x, p, y, work);
         const double *c = y + (PLAIN ? 0 : NQ * LAST), *w = s->weights;
         const double h = w ? weighted_step(x, y, w, log_rtol, least) : step_length(x, y, 0, log_rtol, least);
         if (!(h > 1e-13 * (1 + fabs(t)))) {

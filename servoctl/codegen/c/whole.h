@@ -11,10 +11,11 @@
 
 /* Samples at `count` times in the order of the motion, whose steps are written to k and jets q, gamma', ..., gamma^(s) to
    `jets`. Series are compared with the equations at parts `inside` of each step, and at instants no farther apart than
-   `distance`: at the samples, if rows determine their rates and they are as dense. */
+   `distance`: at the samples, if rows determine their rates and they are as dense; not at knots, where equations have other
+   branches: the ends of `Steps` but the last one, and this if `to_knot`. rtol and atol judge invariants. */
 typedef struct {
-    int64_t count, parts;
-    double distance;
+    int64_t count, parts, to_knot;
+    double distance, rtol, atol;
     const double *times, *inside;
     int64_t *k;
     double *jets, *facts;
@@ -35,11 +36,36 @@ static double scaled(const double *y, const double *x)
     return largest;
 }
 
+/* The tolerance of an invariant by that of the state x: of each entry its derivative times atol + rtol times the largest
+   entry of its level; y are the values and the Jacobian of all of them. */
+static double tolerance(const double *y, const double *x, int64_t invariant, const Whole *w)
+{
+    double sum = 0;
+    for (int64_t first = 0, end = NQ; first < NX; first = end, end += N) {
+        double largest = 0;
+        for (int64_t j = first; j < end; j++) widen(&largest, fabs(x[j]));
+        for (int64_t j = first; j < end; j++) {
+            sum += fabs(y[INVARIANTS * (1 + j) + invariant]) * (w->atol + w->rtol * largest);
+        }
+    }
+    return sum;
+}
+
+/* Whether numbers are finite. */
+static int all_finite(int64_t count, const double *x)
+{
+    double sum = 0;
+    for (int64_t i = 0; i < count; i++) sum += x[i] * 0;
+    return sum == 0;
+}
+
+static inline double last_end(const Steps *s) { return s->ends[(int64_t)s->count - 1]; }
+
 /* Whether rows determine the rates of samples of the whole span that are no farther apart than the distance. */
 static int dense(const Steps *s, const Whole *w)
 {
 #ifdef SETTLED
-    if (!w->count || w->times[0] != s->start[0] || w->times[w->count - 1] != *s->ends) return 0;
+    if (!w->count || w->times[0] != s->start[0] || w->times[w->count - 1] != last_end(s)) return 0;
     for (int64_t at = 1; at < w->count; at++) {
         if (!(fabs(w->times[at] - w->times[at - 1]) <= w->distance)) return 0;
     }
@@ -50,13 +76,14 @@ static int dense(const Steps *s, const Whole *w)
 #endif
 }
 
-/* Enlarge `farthest` by the instants of a step of the length h from a row of the log. */
-static void compare(const double *row, double h, double end, int by_samples, const Whole *w,
-                    const double *p, double *farthest)
+/* Enlarge `farthest` by the instants of a step from a row of the log to an end, which may be a knot. */
+static void compare(const double *row, double end, int knot, int by_samples, const Whole *w, const double *p,
+                    double *farthest)
 {
+    const double h = end - row[0];
     const double *x = row + 1, *of_q = x + NX, *c = of_q + (PLAIN ? 0 : NQ * LAST);
     const double equal = by_samples ? 0 : fmax(ceil(fabs(h) / w->distance), 1);
-    const int64_t all = w->parts + (int64_t)equal;
+    const int64_t all = w->parts + (int64_t)equal - (knot && !by_samples);
     for (int64_t first = 0; first < all; first += W_LANES) {
         W s = ALL(0.0), jets[NQ + TOP * N];
         const int64_t count = all - first < W_LANES ? all - first : W_LANES;
@@ -82,51 +109,56 @@ static void compare(const double *row, double h, double end, int by_samples, con
     }
 }
 
-/* Returns the number of steps to the only one of the ends; -1 where they do not reach it. `facts` are, in this order:
-     N                      how far gamma^(s) of the series is at most from that of the equations
-     1                      the longest step
-     NX                     the largest size of each state at the ends of all steps
-     INVARIANTS             the largest size of each invariant after each step
-     N_PIVOTS               the least size of each pivot, 0 where its sign changes
-     N_PIVOTS               its largest size
-     OUTPUTS_OF_INVARIANTS  the outputs of `invariants` at the start
-     1                      the largest invariant at the end, relative to its gradient times the state */
+/* Returns the number of steps to the last one of the ends; -1 where they do not reach it, or samples are not finite.
+   `facts` are, in this order:
+     N           how far gamma^(s) of the series is at most from that of the equations
+     1           the longest step
+     NX          the largest size of each state at the ends of all steps
+     INVARIANTS  the largest size of each invariant after each step, relative to its tolerance at the start
+     N_PIVOTS    the least size of each pivot, 0 where its sign changes
+     N_PIVOTS    its largest size
+     1           the largest invariant at the end, relative to its gradient times the state */
 int64_t FN(whole)(const Steps *s, const Whole *w)
 {
-    double p[NP];
+    double p[NP], allowed[INVARIANTS + 1], values[OUTPUTS_OF_INVARIANTS + 1];
     const int64_t steps = FN(taylor)(s), columns = 1 + NX + NY;
     double *end = s->log + steps * columns, *farthest = w->facts, *longest = farthest + N, *states = longest + 1;
-    double *residuals = states + NX, *least = residuals + INVARIANTS, *most = least + N_PIVOTS, *start = most + N_PIVOTS;
+    double *residuals = states + NX, *least = residuals + INVARIANTS, *most = least + N_PIVOTS, *drifted = most + N_PIVOTS;
+    const double *knot = s->ends;
     const int by_samples = dense(s, w);
-    if (end[0] != *s->ends) return -1;
-    on_branch(s->start + 1 + NX, (s->start[0] + *s->ends) / 2, p);
+    if (end[0] != last_end(s)) return -1;
+    on_branch(s->start + 1 + NX, (end[-columns] + end[0]) / 2, p);
     NAME(end[0], end + 1, p, end + 1 + NX);
-    for (double *fact = farthest; fact < start; fact++) *fact = 0;
+    for (double *fact = farthest; fact <= drifted; fact++) *fact = 0;
     for (int64_t i = 0; i < N_PIVOTS; i++) least[i] = INFINITY;
     for (int64_t step = 0; step <= steps; step++) {
         const double *row = s->log + step * columns, *pivots = row + 1 + NX + N_C, *first = s->log + 1 + NX + N_C;
-        double later[OUTPUTS_OF_INVARIANTS + 1], *values = step ? later : start;
         FN(invariants)(row[0], row + 1, p, values);
-        for (int64_t i = 0; i < INVARIANTS && step; i++) widen(residuals + i, fabs(values[i]));
+        for (int64_t i = 0; i < INVARIANTS; i++) {
+            if (step && values[i] != 0) widen(residuals + i, fabs(values[i]) / allowed[i]);
+            if (!step) allowed[i] = tolerance(values, row + 1, i, w);
+        }
         for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(row[1 + i]));
         for (int64_t i = 0; i < N_PIVOTS; i++) {
             const double size = pivots[i] * first[i] > 0 ? fabs(pivots[i]) : 0;
             least[i] = size < least[i] ? size : least[i];
             widen(most + i, fabs(pivots[i]));
         }
-        if (step == steps) start[OUTPUTS_OF_INVARIANTS] = scaled(values, row + 1);
+        if (step == steps) *drifted = scaled(values, row + 1);
         if (step == steps) break;
         widen(longest, fabs(row[columns] - row[0]));
-        compare(row, row[columns] - row[0], row[columns], by_samples, w, p, farthest);
+        const int at_knot = row[columns] == *knot && (step + 1 < steps || w->to_knot);
+        compare(row, row[columns], at_knot, by_samples, w, p, farthest);
+        knot += row[columns] == *knot;
     }
-    const double forward = *s->ends > s->start[0] ? 1 : -1;
+    const double forward = last_end(s) > s->start[0] ? 1 : -1;
     for (int64_t at = 0, step = 0; at < w->count; at++) {
         while (step < steps - 1 && forward * s->log[(step + 1) * columns] <= forward * w->times[at]) step++;
         w->k[at] = step;
     }
     FN(taylor_jets)(s->log, w->count, w->k, w->times, p, TOP, 0, w->jets);
     by_rows(s->log, w->count, w->k, w->times, p, NX + N, w->jets, farthest);
-    return steps;
+    return all_finite(w->count * (NX + N), w->jets) ? steps : -1;
 }
 
 #endif
