@@ -523,8 +523,3 @@ def _slots(chunks, home, of):
                 n_slots = max(n_slots, slots[target] + 1)
                 expiring[last[target]].append(slots[target])
     return slots, n_slots
-
-
-def contains(f, operation):
-    """Whether an SX function contains an operation, such as ``casadi.OP_ERFINV``."""
-    return any(f.instruction_id(k) == operation for k in range(f.n_instructions()))

@@ -32,10 +32,12 @@ DIVIDES = 1e-3  # of its usual size: a combination is not divided by a jet that 
 
 
 class Deep(Exception):
-    """A row would differentiate a residual or a balance more often than allowed."""
+    """A row would differentiate a residual or a balance more often than allowed; `complete` can go on from there."""
+
+    so_far = None
 
 
-def complete(q, rows, context, starts=None, most=None):
+def complete(q, rows, context, starts=None, most=None, so_far=None):
     """Replace rows by hidden constraints until their leading matrix has full row rank.
 
     Parameters
@@ -48,6 +50,8 @@ def complete(q, rows, context, starts=None, most=None):
         Starts for points of the manifold.
     most : int, optional
         Derivatives of a residual or a balance in a row, at most.
+    so_far : tuple, optional
+        Of a `Deep`: where the search with these arguments ended.
 
     Returns
     -------
@@ -72,10 +76,10 @@ def complete(q, rows, context, starts=None, most=None):
     Deep
         If there are more derivatives than `most`.
     """
-    rows, pivots, points, dropped = list(rows), [], starts, 0.0
+    rows, pivots, points, dropped = so_far or (list(rows), [], starts, 0.0)
     while True:
-        level = max([row.order for row in rows], default=0)
-        points = sample(q, rows, level, context, starts=points)
+        level, before = max([row.order for row in rows], default=0), points
+        points = sample(q, rows, level, context, starts=before)
         if not len(points.t):
             raise _no_common_state(q, rows, context)
         numbers, sizes = leading(q, rows, points)
@@ -87,7 +91,11 @@ def complete(q, rows, context, starts=None, most=None):
         dropped = max(dropped, rank.dropped)
         if rank.rank == len(rows):
             return rows, replace(rank, dropped=dropped), points.take(same), pivots
-        combination = _lowest(q, rows, numbers[:, :, same], context, points, most)
+        try:
+            combination = _lowest(q, rows, numbers[:, :, same], context, points, most)
+        except Deep as deep:
+            deep.so_far = rows, pivots, before, dropped
+            raise
         if combination.row.order < 0:
             raise _dependent(q, rows, combination, context)
         rows[combination.replaces] = replace(combination.row, parts=())
