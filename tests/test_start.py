@@ -347,6 +347,53 @@ def test_a_simulation_from_rest_says_that_the_machine_stands_still(name):
     assert "square" not in str(caught.value) and 0 < caught.value.details["nearest_time"] < 0.3
 
 
+def pushed_car(residuals):
+    """A car that does not skid, pushed along its heading and turned, under residuals of its coordinates."""
+    q = sv.coordinates("x y psi")
+    (x, y, psi), (dx, dy, dpsi) = q, q.d(1)
+    gibbs = sv.rigid_body(q, 2.0, (0, 0, 0.5), position=(x, y), rates=(0, 0, dpsi))
+    push = ca.vertcat(ca.cos(psi), ca.sin(psi), 0)
+    skid = {"skid": -dx * ca.sin(psi) + dy * ca.cos(psi)}
+    mechanism = sv.Mechanism(q, gibbs=gibbs, constraints=skid, actuators={"push": push, "turn": psi})
+    return sv.derive(mechanism, sv.Program(residuals(q)))
+
+
+def turning_back(q):
+    """A path that turns back at t = 1 s, along a line or a curve, by position or by velocity."""
+    s, c, s3 = q.t - q.t**2 / 2, ca.cos(0.3 * q.t), ca.sin(0.3 * q.t)
+    return {
+        "line": {"X": q["x"] - s, "Y": q["y"] - 0.2 * s},
+        "cusp": {"X": q["x"] - s, "Y": q["y"] - s**2},
+        "velocity": {"X": q.d(1)[0] - (1 - q.t), "Y": q.d(1)[1] - 0.2 * (1 - q.t)},
+        "turning": {"V": c * q.d(1)[0] + s3 * q.d(1)[1] - (1 - q.t), "H": c * q.d(1)[1] - s3 * q.d(1)[0]},
+    }
+
+
+@pytest.mark.parametrize("along", ["line", "cusp", "velocity", "turning"])
+def test_a_car_that_turns_back_is_told_to_stand_still_there(along):
+    model = pushed_car(lambda q: turning_back(q)[along])
+    with refused(sv.SingularProgram, "stands still", "psi", "skid", rows=["skid"], coordinates=("psi",)) as caught:
+        sv.simulate(model, model.start(guess={"dx": 1.0}), (0.0, 2.0))
+    assert caught.value.details["t"] == pytest.approx(1.0, abs=1e-9)
+    assert caught.value.details["nearest_time"] == pytest.approx(1.001)
+    assert "square" not in str(caught.value) and caught.value.run.t[-1] <= 1.0
+
+
+def test_a_car_at_rest_whose_speed_is_free_is_told_to_start_in_motion():
+    model = pushed_car(lambda q: {"across": q.dt(q["y"] - 0.3)})
+    with refused(sv.SingularProgram, "stands still", "psi", "model.start(dx=", rows=["skid"], nearest_time=None) as caught:
+        sv.simulate(model, model.start(), (0.0, 2.0))
+    assert caught.value.details["rates"] == ("dx",)
+
+
+def test_an_actuator_that_acts_on_no_residual_is_not_told_to_write_residuals_otherwise():
+    """With y held the car points along x, where its push does not act on y."""
+    model = pushed_car(lambda q: {"across": q.dt(q["y"] - 0.3)})
+    with refused(sv.SingularProgram, "'push'", "2", rows=["push"]) as caught:
+        sv.simulate(model, model.start(dx=1.0), (0.0, 2.0))
+    assert "square" not in str(caught.value)
+
+
 def rolled(path, duration=4.0):
     """The bicycle of `bicycle` along a path of smoothness 6 from rest."""
     model = bicycle()

@@ -435,8 +435,8 @@ class Compiled:
 
         Parameters
         ----------
-        start : (t0, (n_x,) array, t1)
-            Start [s], the state there, and the end [s].
+        start : (t0, (n_x,) array, ends)
+            Start [s], the state there, and the end or the instants (K,) at which steps end [s].
         p : (n_p,) array
         tolerances : (rtol, atol)
             As for `taylor`.
@@ -444,8 +444,9 @@ class Compiled:
             Largest number of steps.
         times : (N,) array
             Samples in the order of the motion [s].
-        net : ((M,) array, float)
-            Where series are compared with the equations: parts of each step, and a distance of instants [s].
+        net : ((M,) array, float, bool)
+            Where series are compared with the equations: parts of each step, and a distance of instants [s]; not at
+            the end if that is a knot.
         judged : (rtol, atol)
             Of the states, which judge "invariants".
 

@@ -68,13 +68,14 @@ class Library:
         run.restype = ctypes.c_int64
         return run
 
-    def whole(self, t1, tolerances, most, times, net, sizes):
+    def whole(self, ends, tolerances, most, times, net, sizes):
         """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
-        task, (inside, *net), count = self.workspace.steps, net, len(times)
-        task.of(float(t1), *tolerances, 0.0, most, None)
+        task, (inside, distance, to_knot, *judged), count = self.workspace.steps, net, len(times)
+        task.of(ends, *tolerances, 0.0, most, None)
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
-        samples = np.array([count, len(inside), 0, 0, 0, *(a.ctypes.data for a in (times, inside, k, jets, facts))])
-        samples.view(float)[2:5] = net
+        places = (a.ctypes.data for a in (times, inside, k, jets, facts))
+        samples = np.array([count, len(inside), to_knot, 0, 0, 0, *places])
+        samples.view(float)[3:6] = distance, *judged
         steps = self._whole(task.pointer, argument(samples))
         return (steps, jets, facts) if steps >= 0 else None
 

@@ -107,11 +107,11 @@ def run_loop(ode, law, loop, advance=None):
     else:
         done, status = _native(native, law, loop, logs)
     if exact:
-        logs["law_x"] = _columns(logs["x"], loop.measured)
+        logs["law_x"] = _by_columns(logs["x"], loop.measured)
     return status, *(log[:done] for log in logs.values())
 
 
-def _columns(x, indices):
+def _by_columns(x, indices):
     """Columns of x (N, n_x), without a copy if they are next to each other."""
     some = indices.tolist()
     adjoining = some and some == [*range(some[0], some[0] + len(some))]

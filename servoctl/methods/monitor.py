@@ -629,14 +629,30 @@ class Monitor:
             f"The program is singular at t = {t:.7g} s: {what}{where}; {why}.",
             f"{self._how_small(measure)}{'The actuation or a reaction is' if forces else 'Accelerations are'} "
             f"undetermined in the direction of {', '.join(direction)}.",
-            do="Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
-            "plan around this state. The run before it is in .run.",
+            do=f"{self._advice(lost or dependent)} The run before it is in .run.",
             t=float(t),
             measure=measure,
             rows=lost or dependent,
             zero=zero,
             direction=direction,
         )
+
+    def _advice(self, lost):
+        """What to do where rows lose their rank: as designed rows can be written otherwise, derived ones cannot."""
+        r = self.model.reduction
+        written = {row.name for row in r.rows if row.name in r.original and not row.story}
+        actuators, residuals = r.mechanism.actuators, r.program.residuals
+        if written.intersection(lost):
+            return (
+                "Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
+                "plan around this state."
+            )
+        if r.program.by == "actuators" and len(actuators) > len(residuals) and {*actuators}.intersection(lost):
+            return (
+                f"Program as many residuals as there are actuators, {len(actuators)}: weights choose among them, and "
+                "here one acts on no residual. Or plan around this state."
+            )
+        return "Plan around this state, or program other outputs."
 
     def _how_small(self, measure):
         """The rank measure as a sentence; a motion that begins at a singular state has no better one, or none."""

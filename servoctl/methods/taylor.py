@@ -21,7 +21,7 @@ from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
-from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible
+from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
 from servoctl.model.equations import monitored_rows
@@ -444,20 +444,21 @@ class TaylorSteps(Stepping):
     def _in_one_call(self, t0, x0, t1, t_eval, knots):
         """Take a motion whose steps, pivots and residuals are all in order; False if one of them must be inspected."""
         model, watched = self.model, (self.family, self.events, arguments(self.model))
-        inside = len(breakpoints((t0, t1), knots)) > 2
-        plain = not (inside or self.every or self.settings.jets) and np.ndim(self.tolerances[1]) == 0
+        plain = not (self.every or self.settings.jets) and np.ndim(self.tolerances[1]) == 0
         if not plain or any(what is not None for what in watched):
             return False
-        p, net = np.append(model.parameters, (t0 + t1) / 2), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT))
-        judged = resolved(*self.tolerances)
-        whole = self.f.whole((t0, x0, t1), p, self.tolerances, self.most, t_eval, net, judged)
+        _, *ends = breakpoints((t0, t1), knots)
+        to_knot = len(knots) > 0 and np.abs(np.subtract(knots, t1)).min() <= margin_at(t1, (t0, t1))
+        p, net = np.append(model.parameters, np.nan), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT), to_knot)
+        task, judged = (t0, x0, ends if len(ends) > 1 else float(t1)), resolved(*self.tolerances)
+        whole = self.f.whole(task, p, self.tolerances, self.most, t_eval, net, judged)
         if whole is None or whole[0] == self.most:
             return False
         steps, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
         if "settled" not in self.f.others:
             top = self.rates.grid(t_eval, jets[: self.n_x], model.parameters)[self.n_x - self.n : self.n_x]
-            farthest = np.maximum(farthest, np.abs(top - jets[-self.n :]).max(axis=1, initial=0.0))
-            jets[-self.n :] = top
+            off = np.abs(top - jets[-self.n :])[:, ~np.isin(t_eval, [*ends[:-1], t1] if to_knot else ends[:-1])]
+            farthest, jets[-self.n :] = np.maximum(farthest, off.max(axis=1, initial=0.0)), top
         if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(farthest).all():
             return False
         if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any() or not (residuals <= LEAVES).all():

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 
 from servoctl.errors import ServoError, SingularProgram
-from servoctl.model.rest import first_motion, standstill
+from servoctl.model.rest import first_motion, standstill_near
 from servoctl.reduction.rows import alternatives
 from servoctl.reduction.self_motion import self_motion
 
@@ -113,9 +113,10 @@ def explain(model, t, x, lost, **facts):
     Machines that roll may stand still there, or relative degrees be others than in motion.
     """
     chosen = dict(zip(model.state_names, map(float, x), strict=True))
-    still = standstill(model, t, chosen)
-    if still is not None:
-        return still.error(t, first_motion(model, t, chosen, still), chosen, **facts)
+    found = standstill_near(model, t, chosen)
+    if found is not None:
+        at, still = found
+        return still.error(at, first_motion(model, at, chosen, still), chosen, **facts)
     prescribed = any(name in model.reduction.original for name in lost)
     large = model.function("ode").operations > LARGEST_EXPLAINED
     return None if prescribed or large else _lost_degrees(model, t, np.asarray(x, dtype=float), **facts)

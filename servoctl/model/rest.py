@@ -22,6 +22,8 @@ MOVES = 1e-5  # velocities above this, likewise, leave six digits of directions 
 LATER = tuple(1e-3 * 2.0**k for k in range(9))  # of the time to the next knot, where the motion may have begun
 FAINT = 1e-6  # of their usual size: divisors above this leave four digits of what depends on their squares
 NEAR_LIMIT = 1e-2  # rad or m: distance of the first value from the limit up to which extrapolation is trusted
+BESIDE = 1e-4  # s, from the end of a motion to a standstill at which it ends, at most
+SECANTS = 4  # steps towards that instant
 EQUAL = 1e-9  # difference of values at two instants that is rounding, at velocities of MOVES
 
 
@@ -35,10 +37,13 @@ class Standstill:
         Those that the constraints determine in motion only.
     rows : tuple of str
         These constraints.
+    rates : tuple of str
+        Velocities that no constraint determines: with one of them the machine may start in motion.
     """
 
     coordinates: tuple
     rows: tuple
+    rates: tuple = ()
 
     def error(self, t, nearest=None, values=None, **facts):
         """The error of a program that is singular because its machine stands still at t [s].
@@ -54,12 +59,15 @@ class Standstill:
             "Constraints that are linear in velocities determine directions in motion only, so that no motion can be "
             "computed through a standstill.",
             nearest="" if nearest is None else f"t = {nearest:g} s, where it moves.",
-            do="End the motion before this instant, or give the path a speed there."
-            if nearest is None
-            else f"Simulate from {begin} on, and end before the next standstill; or give the path a speed there.",
+            do=f"Simulate from {begin} on, and end before the next standstill; or give the path a speed there."
+            if nearest is not None
+            else f"Start in motion, as by model.start({self.rates[0]}=1.0), or program a speed."
+            if self.rates
+            else "End the motion before this instant, or give the path a speed there.",
             t=float(t),
             coordinates=self.coordinates,
             nearest_time=nearest,
+            rates=self.rates,
             **facts | {"rows": list(self.rows)},
         )
 
@@ -186,15 +194,41 @@ def standstill(model, t, chosen):
     """What is open at t [s] while the machine stands still, about the chosen values; None if it moves."""
     rows, equations, aim, x = _at_rest(model, t, chosen)
     q = model.reduction.mechanism.q
-    still = np.abs(x[q.nq :]).max(initial=0.0) <= STANDS * (1.0 + np.abs(x[: q.nq]).max())
-    if not (still and np.abs(equations.scaled(x)).max(initial=0.0) < TOLERANCE):
+    if not np.abs(equations.scaled(x)).max(initial=0.0) < TOLERANCE:
         return None
+    slow = STANDS * (1.0 + np.abs(x[: q.nq]).max())
+    x[q.nq :][np.abs(x[q.nq :]) <= slow] = 0.0  # by rounding they would determine directions
     directions = {row.name: model.gradient_jets(row.name) for row in rows if row.order > 0}
     directions = {row: [name for name in names if name in q.names] for row, names in directions.items()}
     free = free_names(equations, x, aim, {name for names in directions.values() for name in names})
     open_ = {row: [name for name in names if name in free] for row, names in directions.items()}
     coordinates = tuple(dict.fromkeys(name for names in open_.values() for name in names))
-    return Standstill(coordinates, tuple(row for row, names in open_.items() if names)) if coordinates else None
+    moving = np.abs(_rates(model, t, x)[[name not in coordinates for name in q.names]]).max(initial=0.0)
+    if not coordinates or moving > slow:
+        return None
+    turning = {rate for name, rate in zip(q.names, q.jet_names(1), strict=False) if q.plain and name in coordinates}
+    rates = tuple(name for name in free if name in q.jet_names(1) and name not in turning)
+    return Standstill(coordinates, tuple(row for row, names in open_.items() if names), rates)
+
+
+def standstill_near(model, t, chosen):
+    """The instant beside t [s] at which the machine stands still, and what is open there; None if there is none.
+
+    By the secant method: a motion stops at the last instant at which its pivots have digits.
+    """
+    for _ in range(SECANTS):
+        still = standstill(model, t, chosen)
+        if still is not None:
+            return t, still
+        before, after = (_rates(model, at, _at_rest(model, at, chosen)[3]) for at in (t, t + BESIDE))
+        change = after - before
+        if not np.any(change):
+            return None
+        step = -BESIDE * (before @ change) / (change @ change)
+        if not abs(step) < BESIDE:
+            return None
+        t += step
+    return None
 
 
 def _limit(model, t, held, chosen, still):
@@ -253,13 +287,13 @@ def _moves(model, t, guess, still):
         return False
     q = model.reduction.mechanism.q
     measured = [name not in still.coordinates for name in q.names]
-    speed = np.abs(_rates_of_coordinates(model, state)[measured]).max(initial=0.0)
+    speed = np.abs(_rates(model, state.t, state.values)[measured]).max(initial=0.0)
     return bool(speed > MOVES * (1.0 + np.abs(state.values[: q.nq]).max())) and _determined(model, state)
 
 
-def _rates_of_coordinates(model, state):
+def _rates(model, t, x):
     """q' (nq,) at a state, also where velocities are others."""
     q, parameters = model.reduction.mechanism.q, ca.vertcat(*model.reduction.mechanism.parameters.symbols)
     arguments = q.t, q.jet(0), q.jet(1), parameters
     rates = model.once("rates of coordinates", lambda: ca.Function("rates", arguments, [ca.vertcat(*q.d(1))]))
-    return np.ravel(rates(state.t, state.values[: q.nq], state.values[q.nq : q.nq + q.n], model.parameters))
+    return np.ravel(rates(t, x[: q.nq], x[q.nq : q.nq + q.n], model.parameters))

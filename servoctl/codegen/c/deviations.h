@@ -29,7 +29,7 @@ COLD void terms(const double *row, double h, int64_t k, double power, double *re
 
 /* Series of the deviations of a step from a row: half the difference of those at the states with the deviations times
    `nearby` added and subtracted. */
-COLD void series_of(const Deviations *d, const double *row, const double *p)
+COLD void series_of(const Deviations *d, const double *row, const double *p, double *work)
 {
     double below[NX + NY];
     for (int64_t j = d->fixed; j < d->F; j++) {
@@ -40,8 +40,8 @@ COLD void series_of(const Deviations *d, const double *row, const double *p)
             above[1 + i] = row[1 + i] + nearby * d->sizes[i] * v[i];
             below[i] = row[1 + i] - nearby * d->sizes[i] * v[i];
         }
-        NAME(row[0], above + 1, p, above + 1 + NX);
-        NAME(row[0], below, p, below + NX);
+        FN(moving)(row[0], above + 1, p, above + 1 + NX, work);
+        FN(moving)(row[0], below, p, below + NX, work);
         for (int64_t i = 0; i < NX + NY; i++) above[1 + i] = (above[1 + i] - below[i]) * unit;
     }
 }
@@ -114,7 +114,7 @@ __attribute__((cold)) int64_t FN(deviations)(const Deviations *d)
 {
     const double log_rtol = log2(LAST_TERM * d->settings[0]), least = d->settings[1] / d->settings[0];
     const int64_t F = d->F, S = PADDED(d->instants), start = 0;
-    double row[1 + NX + NY], p[NP], P[F * F], R[F * F], next[F * F], *log = d->log;
+    double row[1 + NX + NY], p[NP], P[F * F], R[F * F], next[F * F], work[WORK], *log = d->log;
     int64_t steps = 0, first = 1;
     for (int64_t i = 0; i < F * F; i++) P[i] = i % (F + 1) == 0;
     for (int64_t i = 0; i < F * NX && d->instants; i++) d->Z[i * S] = d->Q[i];
@@ -122,12 +122,13 @@ __attribute__((cold)) int64_t FN(deviations)(const Deviations *d)
         const double end = d->cuts[cut];
         double t = d->cuts[cut - 1];
         on_branch(d->p, (t + end) / 2, p);
+        FN(still)(t, d->x, p, 0, work);
         for (int64_t m; t != end; steps++, first += m) {
             if (steps == d->most) return -1;
             row[0] = t;
             for (int64_t i = 0; i < NX; i++) row[1 + i] = d->x[i];
-            NAME(t, d->x, p, row + 1 + NX);
-            series_of(d, row, p);
+            FN(moving)(t, d->x, p, row + 1 + NX, work);
+            series_of(d, row, p, work);
             t = step_on(d, row, step_length(d->x, row + 1 + NX, 0, log_rtol, least), end, p, first, &m);
             if (isnan(t)) return -1;
             FN(taylor_jets)(row, 1, &start, &t, p, TOP - 1, 0, d->x);

@@ -11,9 +11,10 @@
 
 /* Samples at `count` times in the order of the motion, whose steps are written to k and jets q, gamma', ..., gamma^(s) to
    `jets`. Series are compared with the equations at parts `inside` of each step, and at instants no farther apart than
-   `distance`: at the samples, if rows determine their rates and they are as dense. rtol and atol judge invariants. */
+   `distance`: at the samples, if rows determine their rates and they are as dense; not at knots, where equations have other
+   branches: the ends of `Steps` but the last one, and this if `to_knot`. rtol and atol judge invariants. */
 typedef struct {
-    int64_t count, parts;
+    int64_t count, parts, to_knot;
     double distance, rtol, atol;
     const double *times, *inside;
     int64_t *k;
@@ -58,11 +59,13 @@ static int all_finite(int64_t count, const double *x)
     return sum == 0;
 }
 
+static inline double last_end(const Steps *s) { return s->ends[(int64_t)s->count - 1]; }
+
 /* Whether rows determine the rates of samples of the whole span that are no farther apart than the distance. */
 static int dense(const Steps *s, const Whole *w)
 {
 #ifdef SETTLED
-    if (!w->count || w->times[0] != s->start[0] || w->times[w->count - 1] != *s->ends) return 0;
+    if (!w->count || w->times[0] != s->start[0] || w->times[w->count - 1] != last_end(s)) return 0;
     for (int64_t at = 1; at < w->count; at++) {
         if (!(fabs(w->times[at] - w->times[at - 1]) <= w->distance)) return 0;
     }
@@ -73,13 +76,14 @@ static int dense(const Steps *s, const Whole *w)
 #endif
 }
 
-/* Enlarge `farthest` by the instants of a step of the length h from a row of the log. */
-static void compare(const double *row, double h, double end, int by_samples, const Whole *w,
-                    const double *p, double *farthest)
+/* Enlarge `farthest` by the instants of a step from a row of the log to an end, which may be a knot. */
+static void compare(const double *row, double end, int knot, int by_samples, const Whole *w, const double *p,
+                    double *farthest)
 {
+    const double h = end - row[0];
     const double *x = row + 1, *of_q = x + NX, *c = of_q + (PLAIN ? 0 : NQ * LAST);
     const double equal = by_samples ? 0 : fmax(ceil(fabs(h) / w->distance), 1);
-    const int64_t all = w->parts + (int64_t)equal;
+    const int64_t all = w->parts + (int64_t)equal - (knot && !by_samples);
     for (int64_t first = 0; first < all; first += W_LANES) {
         W s = ALL(0.0), jets[NQ + TOP * N];
         const int64_t count = all - first < W_LANES ? all - first : W_LANES;
@@ -105,7 +109,7 @@ static void compare(const double *row, double h, double end, int by_samples, con
     }
 }
 
-/* Returns the number of steps to the only one of the ends; -1 where they do not reach it, or samples are not finite.
+/* Returns the number of steps to the last one of the ends; -1 where they do not reach it, or samples are not finite.
    `facts` are, in this order:
      N           how far gamma^(s) of the series is at most from that of the equations
      1           the longest step
@@ -120,9 +124,10 @@ int64_t FN(whole)(const Steps *s, const Whole *w)
     const int64_t steps = FN(taylor)(s), columns = 1 + NX + NY;
     double *end = s->log + steps * columns, *farthest = w->facts, *longest = farthest + N, *states = longest + 1;
     double *residuals = states + NX, *least = residuals + INVARIANTS, *most = least + N_PIVOTS, *drifted = most + N_PIVOTS;
+    const double *knot = s->ends;
     const int by_samples = dense(s, w);
-    if (end[0] != *s->ends) return -1;
-    on_branch(s->start + 1 + NX, (s->start[0] + *s->ends) / 2, p);
+    if (end[0] != last_end(s)) return -1;
+    on_branch(s->start + 1 + NX, (end[-columns] + end[0]) / 2, p);
     NAME(end[0], end + 1, p, end + 1 + NX);
     for (double *fact = farthest; fact <= drifted; fact++) *fact = 0;
     for (int64_t i = 0; i < N_PIVOTS; i++) least[i] = INFINITY;
@@ -142,9 +147,11 @@ int64_t FN(whole)(const Steps *s, const Whole *w)
         if (step == steps) *drifted = scaled(values, row + 1);
         if (step == steps) break;
         widen(longest, fabs(row[columns] - row[0]));
-        compare(row, row[columns] - row[0], row[columns], by_samples, w, p, farthest);
+        const int at_knot = row[columns] == *knot && (step + 1 < steps || w->to_knot);
+        compare(row, row[columns], at_knot, by_samples, w, p, farthest);
+        knot += row[columns] == *knot;
     }
-    const double forward = *s->ends > s->start[0] ? 1 : -1;
+    const double forward = last_end(s) > s->start[0] ? 1 : -1;
     for (int64_t at = 0, step = 0; at < w->count; at++) {
         while (step < steps - 1 && forward * s->log[(step + 1) * columns] <= forward * w->times[at]) step++;
         w->k[at] = step;
