@@ -237,18 +237,23 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         run = _run(model, motion, (method, drift, knots), started, t1)
         return _resample(run, times) if t_eval is not None and isinstance(method, RungeKutta) else run
 
-    try:
-        run = finished()
-    except KeyboardInterrupt:  # a motion that is computed is kept
-        with without_interruption():
-            run = finished()
-        run = _interrupted_at_its_end(run) if run.status == 0 else run
+    run = _kept(finished)
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
     if run.success and not model.flat and not motion.drifted <= DRIFTED:
         _warn_drifted(run)
     return run
+
+
+def _kept(finished):
+    """The run that a function puts together from a motion: Ctrl-C waits until it is complete."""
+    try:
+        return finished()
+    except KeyboardInterrupt:
+        with without_interruption():
+            run = finished()
+    return _interrupted_at_its_end(run) if run.status == 0 else run
 
 
 def _method_and_drift(model, method, drift, t0, t1):
@@ -450,11 +455,10 @@ def _run(model, motion, settings, start, t1):
     if not motion.pieces:  # interrupted or stopped before the first sample
         motion.add(model, [start.t], start.values[:, None], np.full((model.n, 1), np.nan))
     t, jets = motion.t, motion.jets
-    last = f"t = {t[-1]:.7g} s"
     if motion.stop is not None:
         status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
     elif motion.interrupted:
-        status, message = 1, f"interrupted at {last} of {t1:g} s; what was computed is kept"
+        status, message = 1, f"interrupted at t = {t[-1]:.7g} s of {t1:g} s; what was computed is kept"
     elif motion.ended:
         status, message = 1, f"ended by the event {motion.ended!r} at t = {t[-1]:.9g} s"
     else:
