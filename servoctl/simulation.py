@@ -455,11 +455,10 @@ def _run(model, motion, settings, start, t1):
     if not motion.pieces:  # interrupted or stopped before the first sample
         motion.add(model, [start.t], start.values[:, None], np.full((model.n, 1), np.nan))
     t, jets = motion.t, motion.jets
-    last = f"t = {t[-1]:.7g} s"
     if motion.stop is not None:
         status, message = -1, f"stopped: {str(motion.stop).split('. ')[0]}"
     elif motion.interrupted:
-        status, message = 1, f"interrupted at {last} of {t1:g} s; what was computed is kept"
+        status, message = 1, f"interrupted at t = {t[-1]:.7g} s of {t1:g} s; what was computed is kept"
     elif motion.ended:
         status, message = 1, f"ended by the event {motion.ended!r} at t = {t[-1]:.9g} s"
     else:

@@ -360,6 +360,20 @@ def test_no_consistent_start_anywhere():
     assert error.details["rows"] == ["circle"]
 
 
+@pytest.mark.parametrize("scale, told", [(3.0, False), (1000.0, True)])
+def test_a_path_in_millimetres_is_told_to_be_far_out_of_reach(scale, told):
+    """Two links of 1 m reach 2 m; within a radian the hand moves by 3 m at most."""
+    q = sv.coordinates("a b")
+    a, b = q
+    hand = ca.vertcat(ca.cos(a) + ca.cos(a + b), ca.sin(a) + ca.sin(a + b))
+    arm = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, hand), actuators={"shoulder": a, "elbow": b})
+    path = sv.paths.rest_to_rest(q.t, (scale, scale), (0.9 * scale, scale), duration=2.0)
+    program = sv.Program({"X": hand[0] - path[0], "Y": hand[1] - path[1]})
+    error = stopped(InconsistentStart, ["X", "Y", "guess"], lambda: derive(arm, program))
+    assert ("mm" in str(error)) is told
+    assert not told or (scale - 2) / 4 < error.details["ratio"] < 10 * scale
+
+
 def test_no_consistent_start_at_this_time():
     """sin x = t holds until t = 1."""
     q, mechanism = plane()

@@ -203,14 +203,15 @@ def test_without_a_compiler_one_warning_and_the_same_results(fresh, monkeypatch,
     assert len(caught) == 1
 
 
-def test_a_compiler_that_refuses_native_code_still_compiles(fresh, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("refused", "kept"), [("-march=native", ()), ("-fno-tree-pre", compiler._optional_flags())])
+def test_a_compiler_that_refuses_flags_still_compiles(fresh, tmp_path, monkeypatch, refused, kept):
+    """As clang, which knows no -fno-tree-pre."""
     script = tmp_path / "plain-cc"
-    script.write_text('#!/bin/sh\ncase "$*" in *-march=native*) exit 1;; esac\nexec cc "$@"\n')
+    script.write_text(f'#!/bin/sh\ncase "$*" in *{refused}*) exit 1;; esac\nexec cc "$@"\n')
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
-    model = pendulum(("rk",))
-    model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)
-    assert model.backend == "c" and fresh[-1][0] == str(script)
+    assert compiler.library("int seven(void) { return 7; }", functions.ALONG_A_PATH).seven() == 7
+    assert fresh[-1][0] == str(script) and refused not in fresh[-1] and {*kept} <= {*fresh[-1]}
 
 
 @pytest.mark.parametrize(

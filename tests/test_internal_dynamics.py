@@ -611,10 +611,12 @@ def test_what_takes_less_time_tells_first_that_growth_is_harmless(gallery_model,
     assert judged_by(10.0, "DOP853") == ("neutral", (bound,))
 
 
-def test_deviations_that_shrink_stay_in_the_tangent_space(gallery_model):
+def test_deviations_that_shrink_stay_in_the_tangent_space(gallery_model, monkeypatch):
     """Errors of differences along the constraints do not shrink: one-sided differences leave the tangent space here."""
     model, scene = gallery_model("passive-arm"), gallery["passive-arm"]
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, "Taylor")
+    assert growth.quiet_by_series(model, run, last_index(model, sv.Taylor()))
+    monkeypatch.setattr(flow, "of_any_size", lambda *_: None)  # as where this unit alone could not be compiled
     assert growth.quiet_by_series(model, run, last_index(model, sv.Taylor()))
 
 

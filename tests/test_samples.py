@@ -66,6 +66,13 @@ def test_noise_of_rounded_samples_has_the_size_of_rounding(n, derivative):
         assert noise.part > 0.5
 
 
+@pytest.mark.parametrize("ends", ["natural", "rest"])
+@pytest.mark.parametrize("n", [40, 300])
+@pytest.mark.parametrize("value", [0.0, -2.5])
+def test_nothing_is_said_of_a_path_that_stays(value, n, ends):
+    assert said(through(n, lambda t: np.full_like(t, value), 4, ends)) == []
+
+
 @pytest.mark.parametrize("law", ["time", "there", "back"])
 def test_fewer_samples_as_proposed_give_the_force(law):
     laws = {

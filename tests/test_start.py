@@ -386,6 +386,20 @@ def test_a_car_at_rest_whose_speed_is_free_is_told_to_start_in_motion():
     assert caught.value.details["rates"] == ("dx",)
 
 
+def test_a_path_beyond_the_reach_of_an_arm_is_told_to_keep_within():
+    """Unit links reach 2 m, where the arm is stretched out."""
+    q = sv.coordinates("a b")
+    a, b = q
+    hand = ca.vertcat(ca.cos(a) + ca.cos(a + b), ca.sin(a) + ca.sin(a + b))
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, hand), actuators={"shoulder": a, "elbow": b})
+    out = sv.paths.rest_to_rest(q.t, 1.0, 2.3, 2.0)
+    model = sv.derive(mechanism, sv.Program({"X": hand[0] - out, "Y": hand[1]}), guess={"a": 1.0, "b": -2.0})
+    with refused(sv.SingularProgram, "'X'", "reaches", rows=["X"]) as caught:
+        sv.simulate(model, model.start(guess={"a": 1.0, "b": -2.0}), (0.0, 2.0))
+    reach = ca.Function("reach", [q.t], [out])(caught.value.details["t"])
+    assert float(reach) == pytest.approx(2.0, abs=1e-6)
+
+
 def test_an_actuator_that_acts_on_no_residual_is_not_told_to_write_residuals_otherwise():
     """With y held the car points along x, where its push does not act on y."""
     model = pushed_car(lambda q: {"across": q.dt(q["y"] - 0.3)})

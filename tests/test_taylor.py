@@ -10,8 +10,8 @@ from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import SpecificationError
-from servoctl.jets.series import Series
-from servoctl.jets.tape import Tape, evaluate
+from servoctl.jets.series import Series, _Grouped
+from servoctl.jets.tape import REAL, Tape, evaluate
 from servoctl.methods.taylor import taylor_coefficients
 from servoctl.spec import coordinates
 
@@ -417,3 +417,39 @@ def test_order_40_is_derived_at_all():
     values = {name: 1.0 for k in range(41) for name in q.jet_names(k)}
     assert abs(numbers([q.dt(ca.log(x), 40)], values)[0]) < 1e-13 * factorial(39)
     assert operations(q.dt(ca.log(x), 40)) < 40**2 * 2
+
+
+def coefficients(tape, inputs, first, count):
+    """Coefficients (outputs, count, N) one operation at a time, and a group of equal operations at a time."""
+    single, grouped = Series(tape, inputs), _Grouped(tape, inputs, first, len(inputs[0][0]))
+    with np.errstate(all="ignore"):
+        for _ in range(count):
+            single.advance()
+            grouped.advance()
+    outputs = tape.outputs[:first]
+    one_by_one = [[np.broadcast_to(c, len(inputs[0][0])) for c in single.c[i]] for i in outputs]
+    return np.array(one_by_one, dtype=REAL), np.stack(grouped.values, axis=1)[grouped.plan.place[outputs]]
+
+
+def test_groups_of_operations_have_the_series_of_single_ones():
+    """All operations on one tape, some of which overflow, and some that follow the first outputs."""
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    switching = [ca.fmin(x, y) * ca.fabs(x - y), ca.if_else(x > 1, x * y, ca.atan2(x, y)), ca.SX(3)]
+    overflowing = [x / (1 + ca.exp(20_000 * y)), ca.sqrt(x) / ca.exp(300 * x), x / y]
+    tape = Tape([x, y], [*(make(x, y) for make in UNARY.values()), *switching, *overflowing])
+    curved, straight = ([RNG.uniform(0.3, 1.4, 7).astype(REAL) for _ in range(5)] for _ in "xy")
+    inputs = [curved, [straight[0], 1.0, 0.0, 0.0, 0.0]]
+    for first in (None, 1, 9):
+        single, grouped = coefficients(tape, inputs, first, 5)
+        assert single.shape == (len(tape.outputs[:first]), 5, 7)
+        np.testing.assert_allclose(grouped, single, rtol=1e-15)
+
+
+def test_a_comparison_that_gates_a_term_is_compared_once():
+    """Every derivative of a gate has its condition, not that of the condition being true, and so on."""
+    q = coordinates("x")
+    (x,) = q
+    f = ca.Function("f", [], [q.dt(ca.if_else(x > 1, x**3, x), 4)], {"allow_free": True})
+    codes = [f.instruction_id(k) for k in range(f.n_instructions())]
+    assert ca.OP_IF_ELSE_ZERO in codes
+    assert ca.OP_NE not in codes

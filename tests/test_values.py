@@ -1,11 +1,13 @@
 """Values: models, plants, runs and laws are equal by what they say, travel to other processes, and never change."""
 
 import copy
+import inspect
 import multiprocessing
 import pickle
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import FrozenInstanceError, dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -14,6 +16,7 @@ from refusals import refused
 
 import servoctl as sv
 from servoctl.gallery import gallery, overhead_crane
+from servoctl.values import frozen
 
 SCENES = ("overhead-crane", "appell-hamel", "crane-3d", "constant-speed", "three-cars", "wheeled-robot")
 
@@ -213,3 +216,51 @@ def test_a_copy_of_a_mechanism_has_its_symbols():
     again(other)
     mechanism, _ = overhead_crane()
     assert [a.element_hash() for a in copy.copy(mechanism).q] == [a.element_hash() for a in mechanism.q]
+
+
+class Fields:
+    """Fields of every kind."""
+
+    name: str
+    size: float = 2.0
+    items: list = field(default_factory=list)
+    hidden: int = field(default=3, repr=False, compare=False)
+    _kept: dict = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        self._kept["made"] = self.name
+
+
+def made_by(decorator):
+    return decorator(type("Value", (Fields,), dict(vars(Fields)) | {"__qualname__": "Value"}))
+
+
+def test_frozen_values_are_what_frozen_dataclasses_are():
+    ours, theirs = made_by(frozen), made_by(dataclass(frozen=True))
+    assert str(inspect.signature(ours)) == str(inspect.signature(theirs))
+    for cls in (ours, theirs):
+        a, b = cls("a"), cls("a", hidden=4)
+        assert repr(a) == "Value(name='a', size=2.0, items=[])"
+        assert a == b and a != replace(a, size=3.0) and a != "a"
+        assert a.items is not b.items and a._kept == {"made": "a"} and replace(a, name="c")._kept == {"made": "c"}
+        assert cls.__match_args__ == ("name", "size", "items", "hidden")
+        with pytest.raises(FrozenInstanceError):
+            a.size = 1.0
+        with pytest.raises(FrozenInstanceError):
+            del a.size
+        with pytest.raises(TypeError):
+            cls()
+        with pytest.raises(TypeError, match="unhashable"):
+            hash(a)
+        assert hash(replace(a, items=())) == hash(replace(b, items=()))
+
+
+def test_frozen_values_keep_what_their_class_defines():
+    @frozen(eq=False)
+    class Own:
+        number: int
+
+        def __repr__(self):
+            return "own"
+
+    assert repr(Own(1)) == "own" and Own(1) != Own(1)

@@ -50,8 +50,8 @@ def library(text, level="-O1", exact=False):
     text : str
         C text.
     level : str
-        Optimisation level, perhaps with further flags behind it. "-O1" compiles fastest, and its straight-line code is
-        at most a quarter slower than "-O3".
+        Optimisation level, perhaps with further flags behind it, which a compiler may refuse, as clang does those of
+        gcc. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
     exact : bool
         Whether the results are those of the operations one by one, without contraction.
 
@@ -63,8 +63,9 @@ def library(text, level="-O1", exact=False):
     command, identity = _compiler()
     if command is None:
         return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
-    flags = (*level.split(), *FLAGS, *(ROUNDED if exact else ()))
-    parts = (text, digest(), *flags, *_optional_flags(), identity, platform.machine(), _processor())
+    level, *tuning = level.split()
+    flags = (level, *FLAGS, *(ROUNDED if exact else ())), (*_optional_flags(), *tuning)
+    parts = (text, digest(), *flags[0], *flags[1], identity, platform.machine(), _processor())
     key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
@@ -148,7 +149,10 @@ def _scratch():
 
 @stage("compiling")
 def _build(text, flags, file_name, command):
-    """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full."""
+    """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full.
+
+    `flags` are those that it takes, and those that it may refuse.
+    """
     import subprocess
 
     for directory in (cache_directory, _scratch):
@@ -165,10 +169,11 @@ def _build(text, flags, file_name, command):
 def _compile(text, flags, target, command):
     import subprocess
 
+    flags, optional = flags
     with replacing(target) as temporary:
-        for optional in (_optional_flags(), ()):
+        for some in dict.fromkeys((optional, _optional_flags(), ())):
             done = subprocess.run(
-                [*command, *flags, *optional, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
+                [*command, *flags, *some, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
                 input=text, encoding="utf-8", errors="replace", capture_output=True, cwd=target.parent,
                 check=False, timeout=PATIENCE_WITH_COMPILER,
             )  # fmt: skip

@@ -205,7 +205,8 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
 
     The unit defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
     ``name_point``, ``name_grid``, ``name_casadi`` in the form that CasADi calls, and the functions of each loop's file.
-    For loops in `PHASED` also ``name_instant``, ``name_correction`` and ``name_rest``; see `phases`.
+    For loops in `PHASED` also ``name_instant``, ``name_correction`` and ``name_rest``; see `phases`. For the loop
+    "taylor" ``name_still`` and ``name_moving``; see `series`.
 
     Parameters
     ----------
@@ -522,8 +523,3 @@ def _slots(chunks, home, of):
                 n_slots = max(n_slots, slots[target] + 1)
                 expiring[last[target]].append(slots[target])
     return slots, n_slots
-
-
-def contains(f, operation):
-    """Whether an SX function contains an operation, such as ``casadi.OP_ERFINV``."""
-    return any(f.instruction_id(k) == operation for k in range(f.n_instructions()))

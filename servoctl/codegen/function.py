@@ -19,6 +19,7 @@ from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library, builtin
 from servoctl.codegen.tables import BOUND
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.branches import contains
 
 GRID_POINTS = 2_500  # 20 longer grids take CasADi as long as writing and loading a library, 200 as compiling it
 CALLS = 10_000  # of one point: CasADi has taken as long as compiling takes then, where the function is long
@@ -214,7 +215,7 @@ class Compiled:
         if self._builtin is not None:
             return self._builtin(float(t), self._array("x", x, self._x_shape), self._array("p", p, self._p_shape))
         self._calls += 1
-        if self._calls == CALLS and compiler.compiler() and not emit.contains(self.expression, ca.OP_ERFINV):
+        if self._calls == CALLS and compiler.compiler() and not contains(self.expression, ca.OP_ERFINV):
             library = compiler.library(emit.emit_builtin(self.expression, self._symbol), exact=True)
             self._builtin = library and builtin(library, self._symbol, self.__call__)
             if self._builtin:

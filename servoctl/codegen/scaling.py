@@ -48,7 +48,9 @@ def scaled(statements):
 
 def is_still(operand, still):
     """Whether an operand depends on p alone, as some values do."""
-    return isinstance(operand, Constant) or operand in still or str(operand).startswith("p[")
+    if isinstance(operand, int):
+        return operand in still
+    return isinstance(operand, Constant) or operand.startswith("p[")
 
 
 def needed(statements):
@@ -96,7 +98,7 @@ class _Gathered:
 
     def write(self, operation, *operands):
         """The value of an operation, which is written once."""
-        key = operation, frozenset(Counter(operands).items()) if operation in (ca.OP_MUL, ca.OP_ADD) else operands
+        key = operation, frozenset(operands) if operation in (ca.OP_MUL, ca.OP_ADD) else operands
         if key not in self.written:
             value = self.written[key] = len(self.written)
             self.statements.append((value, operation, operands))
@@ -159,7 +161,9 @@ class _Gathered:
 def _rescaled(scale, form):
     """A form times (number, factors)."""
     number, factors = scale
-    return _Scaled(number * form.number, tuple(sorted((*factors, *form.factors), key=str)), form.value)
+    if factors and form.factors:
+        factors = tuple(sorted((*factors, *form.factors), key=str))
+    return _Scaled(number * form.number, factors or form.factors, form.value)
 
 
 def _scales(operation, operands, moving):

@@ -12,6 +12,7 @@ import numpy as np
 from servoctl import archive
 from servoctl.codegen import emit
 from servoctl.codegen.loops import source
+from servoctl.jets.branches import contains
 from servoctl.units import unit_of
 from servoctl.values import frozen
 
@@ -222,7 +223,7 @@ def _enum(name, array):
 def _source(name, contents):
     functions = "".join(emit.function(f, key, emit.EXPORTED) for key, f in contents.functions.items())
     table = emit.include("table.h")
-    inverse = any(emit.contains(f, ca.OP_ERFINV) for f in contents.functions.values())
+    inverse = any(contains(f, ca.OP_ERFINV) for f in contents.functions.values())
     parts = [
         f'/* {name}.c: written by servoctl {_version()}. C99; link with -lm. */\n#include "{name}.h"\n',
         "#include <math.h>\n",

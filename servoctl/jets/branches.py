@@ -76,6 +76,11 @@ def has_switches(expressions):
     return False
 
 
+def contains(f, *operations):
+    """Whether an SX function contains one of some operations, such as ``casadi.OP_ERFINV``."""
+    return any(f.instruction_id(k) in operations for k in range(f.n_instructions()))
+
+
 class Branches:
     """Smooth expressions in place of ones with branches that depend on some of their symbols.
 
@@ -190,6 +195,8 @@ def without_turns(expression):
     SX scalar
         The expression itself if it is no such sum.
     """
+    if not contains(ca.Function("angles", [], [expression], {"allow_free": True}), ca.OP_ATAN2):
+        return expression
     work, angles = [], []  # symbols in place of angles, with y and x
 
     def value(op, operands):
@@ -374,7 +381,7 @@ def as_text(f):
     -------
     str
     """
-    if not made or not any(f.instruction_id(k) == ca.OP_CALL for k in range(f.n_instructions())):
+    if not made or not contains(f, ca.OP_CALL):
         return f.serialize()
     outputs = f.call(f.sx_in())
     values, marks = _marked([e for y in outputs for e in y.nonzeros()])

@@ -126,6 +126,7 @@ def growth(Z, count, settings):
     Returns
     -------
     quiet : bool
+        False where nothing is compiled.
     scale : (n_x,) array
         Of the states.
     within : (count,) array
@@ -135,9 +136,9 @@ def growth(Z, count, settings):
     of_vectors = n_x**2 + f * n_x * (f + 1) // 2 + (f + 1) * (n_x + 1)
     others = 8 + n_x * (n_x + 3) + (3 * f + 1) * padded(f)
     work = np.empty(2 * S * (f * (n_x + f) + count) + 8 * of_vectors + others)
-    settings, scale, within = np.array(settings), np.empty(n_x), np.empty(count)
-    sizes = map(ctypes.c_int64, (count, n_x, f))
-    found = of_any_size("growth", "growth")(*sizes, *map(pointer, (Z, settings, work, scale, within)))
+    settings, scale, within = np.array(settings), np.full(n_x, np.nan), np.full(count, np.nan)
+    sizes, call = map(ctypes.c_int64, (count, n_x, f)), of_any_size("growth", "growth")
+    found = call is not None and call(*sizes, *map(pointer, (Z, settings, work, scale, within)))
     return bool(found), scale, within
 
 

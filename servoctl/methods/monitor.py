@@ -640,9 +640,15 @@ class Monitor:
     def _advice(self, lost):
         """What to do where rows lose their rank: as designed rows can be written otherwise, derived ones cannot."""
         r = self.model.reduction
-        written = {row.name for row in r.rows if row.name in r.original and not row.story}
+        as_written = (row for row in r.rows if row.name in r.original and not row.story)
+        written = {row.name: row.order for row in as_written if row.name in lost}
         actuators, residuals = r.mechanism.actuators, r.program.residuals
-        if written.intersection(lost):
+        if written and not any(written.values()):
+            return (
+                "Plan a path that keeps away from this state, as from the edge of what the machine reaches, or write "
+                "the residual in a form whose gradient does not vanish there."
+            )
+        if written:
             return (
                 "Write the residual in a form whose gradient does not vanish (linear in velocities, not squared), or "
                 "plan around this state."

@@ -156,6 +156,8 @@ class Model(Shown):
 
     def names_to(self, size):
         """Names of the first `size` jets, beyond γ^(s̄) if necessary."""
+        if size <= len(self.jet_names):
+            return self.jet_names[:size]
         q, names, k = self.reduction.mechanism.q, list(self.jet_names), self.reduction.top
         while len(names) < size:
             k += 1

@@ -22,7 +22,7 @@ MOVES = 1e-5  # velocities above this, likewise, leave six digits of directions 
 LATER = tuple(1e-3 * 2.0**k for k in range(9))  # of the time to the next knot, where the motion may have begun
 FAINT = 1e-6  # of their usual size: divisors above this leave four digits of what depends on their squares
 NEAR_LIMIT = 1e-2  # rad or m: distance of the first value from the limit up to which extrapolation is trusted
-BESIDE = 1e-4  # s, from the end of a motion to a standstill at which it ends, at most
+AFTERWARDS = 1e-4  # s, from the end of a motion to a standstill at which it ends, at most
 SECANTS = 4  # steps towards that instant
 EQUAL = 1e-9  # difference of values at two instants that is rounding, at velocities of MOVES
 
@@ -203,7 +203,7 @@ def standstill(model, t, chosen):
     free = free_names(equations, x, aim, {name for names in directions.values() for name in names})
     open_ = {row: [name for name in names if name in free] for row, names in directions.items()}
     coordinates = tuple(dict.fromkeys(name for names in open_.values() for name in names))
-    moving = np.abs(_rates(model, t, x)[[name not in coordinates for name in q.names]]).max(initial=0.0)
+    moving = np.abs(_state_rates(model, t, x)[[name not in coordinates for name in q.names]]).max(initial=0.0)
     if not coordinates or moving > slow:
         return None
     turning = {rate for name, rate in zip(q.names, q.jet_names(1), strict=False) if q.plain and name in coordinates}
@@ -220,12 +220,12 @@ def standstill_near(model, t, chosen):
         still = standstill(model, t, chosen)
         if still is not None:
             return t, still
-        before, after = (_rates(model, at, _at_rest(model, at, chosen)[3]) for at in (t, t + BESIDE))
+        before, after = (_state_rates(model, at, _at_rest(model, at, chosen)[3]) for at in (t, t + AFTERWARDS))
         change = after - before
         if not np.any(change):
             return None
-        step = -BESIDE * (before @ change) / (change @ change)
-        if not abs(step) < BESIDE:
+        step = -AFTERWARDS * (before @ change) / (change @ change)
+        if not abs(step) < AFTERWARDS:
             return None
         t += step
     return None
@@ -287,11 +287,11 @@ def _moves(model, t, guess, still):
         return False
     q = model.reduction.mechanism.q
     measured = [name not in still.coordinates for name in q.names]
-    speed = np.abs(_rates(model, state.t, state.values)[measured]).max(initial=0.0)
+    speed = np.abs(_state_rates(model, state.t, state.values)[measured]).max(initial=0.0)
     return bool(speed > MOVES * (1.0 + np.abs(state.values[: q.nq]).max())) and _determined(model, state)
 
 
-def _rates(model, t, x):
+def _state_rates(model, t, x):
     """q' (nq,) at a state, also where velocities are others."""
     q, parameters = model.reduction.mechanism.q, ca.vertcat(*model.reduction.mechanism.parameters.symbols)
     arguments = q.t, q.jet(0), q.jet(1), parameters

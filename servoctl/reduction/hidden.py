@@ -27,14 +27,17 @@ from servoctl.reduction.rows import (
 from servoctl.tolerances import NOISE, RESOLVED
 from servoctl.values import frozen
 
+OUT_OF_REACH = 30.0  # least value of a residual, relative to its changes, where mixed units are a likely cause
 DIVIDES = 1e-3  # of its usual size: a combination is not divided by a jet that is smaller at a point
 
 
 class Deep(Exception):
-    """A row would differentiate a residual or a balance more often than allowed."""
+    """A row would differentiate a residual or a balance more often than allowed; `complete` can go on from there."""
+
+    so_far = None
 
 
-def complete(q, rows, context, starts=None, most=None):
+def complete(q, rows, context, starts=None, most=None, so_far=None):
     """Replace rows by hidden constraints until their leading matrix has full row rank.
 
     Parameters
@@ -47,6 +50,8 @@ def complete(q, rows, context, starts=None, most=None):
         Starts for points of the manifold.
     most : int, optional
         Derivatives of a residual or a balance in a row, at most.
+    so_far : tuple, optional
+        Of a `Deep`: where the search with these arguments ended.
 
     Returns
     -------
@@ -71,10 +76,10 @@ def complete(q, rows, context, starts=None, most=None):
     Deep
         If there are more derivatives than `most`.
     """
-    rows, pivots, points, dropped = list(rows), [], starts, 0.0
+    rows, pivots, points, dropped = so_far or (list(rows), [], starts, 0.0)
     while True:
-        level = max([row.order for row in rows], default=0)
-        points = sample(q, rows, level, context, starts=points)
+        level, before = max([row.order for row in rows], default=0), points
+        points = sample(q, rows, level, context, starts=before)
         if not len(points.t):
             raise _no_common_state(q, rows, context)
         numbers, sizes = leading(q, rows, points)
@@ -86,7 +91,11 @@ def complete(q, rows, context, starts=None, most=None):
         dropped = max(dropped, rank.dropped)
         if rank.rank == len(rows):
             return rows, replace(rank, dropped=dropped), points.take(same), pivots
-        combination = _lowest(q, rows, numbers[:, :, same], context, points, most)
+        try:
+            combination = _lowest(q, rows, numbers[:, :, same], context, points, most)
+        except Deep as deep:
+            deep.so_far = rows, pivots, before, dropped
+            raise
         if combination.row.order < 0:
             raise _dependent(q, rows, combination, context)
         rows[combination.replaces] = replace(combination.row, parts=())
@@ -152,7 +161,7 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), vanishing=vanishing)
     row, points = settle(q, chi, rows[:b] + rows[b + 1 :], context, starts)
     if row is None:
-        raise _no_state(rows[:b] + rows[b + 1 :])
+        raise _no_state(q, rows[:b] + rows[b + 1 :], context)
     return _Combination(replace(row, story=story), b, support, points, pivots, chi)
 
 
@@ -371,23 +380,34 @@ def _no_common_state(q, rows, context):
         ranks = decide_each(clean(numbers, sizes))
         rank, _ = generic(ranks)
         if not rank.clear or rank.rank == len(rows):
-            return _no_state(given)
+            return _no_state(q, given, context)
         same = [p for p, other in enumerate(ranks) if other.rank == rank.rank]
         try:
             combination = _lowest(q, rows, numbers[:, :, same], context)
         except InconsistentStart:  # some of the rows alone have no common state
-            return _no_state(given)
+            return _no_state(q, given, context)
         if combination.row.order < 0:
             return _dependent(q, rows, combination, context)
         rows = [combination.row if a == combination.replaces else row for a, row in enumerate(rows)]
 
 
-def _no_state(rows):
+def _no_state(q, rows, context):
+    """The error of rows without a common state; it tells of one that is far from where random points move it."""
+    points = sample(q, [], max(0, *(row.order for row in rows)), context)
+    points = replace(points, t=np.full_like(points.t, points.t[0]))  # a path alone brings no residual to zero
+    values = np.abs(points.evaluate([row.expression for row in rows])[0]).astype(float)
+    with np.errstate(all="ignore"):
+        ratios = np.nan_to_num(values.min(axis=1) / np.ptp(values, axis=1), posinf=0.0)
+    name, ratio = max(zip((row.name for row in rows), ratios.tolist(), strict=True), key=lambda pair: pair[1])
+    far = f"; {name} is {ratio:.0f} times as far from zero as coordinates of usual size change it"
+    far = far if ratio > OUT_OF_REACH else ""
+    units = "Check that lengths have the same unit (m, not mm), pass" if far else "Pass"
     return InconsistentStart(
-        f"No state satisfies {', '.join(sorted({row.name for row in rows}))} and their time derivatives.",
+        f"No state satisfies {', '.join(sorted({row.name for row in rows}))} and their time derivatives{far}.",
         "Newton's method searches for such states about the guess.",
-        do="Pass guess={...} near the motion to derive, or correct the constraints.",
+        do=f"{units} guess={{...}} near the motion to derive, or correct the constraints.",
         rows=[row.name for row in rows],
+        **({"far": name, "ratio": ratio} if far else {}),
     )
 
 

@@ -86,12 +86,12 @@ class Reduction(Packed):
         rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
         return f"Reduction(rows and orders: {rows}; {self.free} free initial values)"
 
-    @property
+    @cached_property
     def top(self):
         """The common order s̄ of the differentiated rows: at least 2, and above the order of rows not affine in it."""
         return max([2, *(row.order + (not row.affine) for row in self.rows)])
 
-    @property
+    @cached_property
     def free(self):
         """The number of free initial values: Σ o_a, and coordinates beyond quasi-velocities and their invariants."""
         q = self.mechanism.q

@@ -53,7 +53,7 @@ def warn_of_samples(switches, values, needs, times):
     for name, k in needs.items():
         for argument, knots in switches.tables(name).items() if k and len(times) > 1 else ():
             samples = Samples(switches, values, name, argument, knots, (times[0], times[-1]))
-            if len(samples.knots) < LEAST_DENSE:
+            if len(samples.knots) < LEAST_DENSE or not samples.move():
                 continue
             steep, noise = samples.steepness(k), samples.noise(k)
             if steep > STEEP:
@@ -113,6 +113,10 @@ class Samples:
         self._coefficient = lambda t, k: switches.coefficient(name, t, values, k)
         self.knots = knots[(knots >= passage[1][0]) & (knots <= passage[1][-1])]
         self.edge = min(EDGE, len(self.knots) // 4)
+
+    def move(self):
+        """Whether the path is no constant."""
+        return np.ptp(self._coefficient(self._windows(1), 0)) > 0
 
     def noise(self, k):
         """The `Noise` of derivative k; None if it is determined, or if what alternates is meant."""

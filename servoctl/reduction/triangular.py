@@ -45,9 +45,9 @@ def completed(q, rows, context, starts):
     """
     try:
         return *complete(q, rows, context, starts, most=SHALLOW), None
-    except Deep:
+    except Deep as deep:
         found = _by_blocks(q, rows, context, starts)
-        return found or (*complete(q, rows, context, starts), None)
+        return found or (*complete(q, rows, context, so_far=deep.so_far), None)
 
 
 def _by_blocks(q, rows, context, starts):
@@ -56,6 +56,8 @@ def _by_blocks(q, rows, context, starts):
     found = triangular(q, rows)
     if not all(_determines(q, block) for block in found[1:]):
         found = max(found, triangular(q, recombined(q, rows)), key=len)
+    if len(found) < 2:
+        return None
     for block in found:
         if not _determines(q, block):
             try:

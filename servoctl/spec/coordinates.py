@@ -37,7 +37,7 @@ class Coordinates:
         self.nq = len(names)
         self.t = ca.SX.sym("t")
         self._q = tuple(ca.SX.sym(name) for name in names)
-        self._w = {}
+        self._w, self._columns = {}, {}  # symbols by order, and as columns
         self._index = {self.t.element_hash(): ("t", 0, 0)}
         self._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(self._q)}
         self.velocity_names = tuple(f"d{name}" for name in names)
@@ -167,7 +167,10 @@ class Coordinates:
 
     def jet(self, k):
         """γ^(k), k >= 1, or q for k = 0, as a column: (n,) or (nq,) SX."""
-        return ca.vertcat(*(self.gamma(k) if _order(k) else self._q))
+        k = _order(k)
+        if k not in self._columns:
+            self._columns[k] = ca.vertcat(*(self.gamma(k) if k else self._q))
+        return ca.SX(self._columns[k])  # which a caller may change
 
     def jet_names(self, k: int) -> tuple[str, ...]:
         """Names of γ^(k), k >= 1, or of q for k = 0."""
@@ -252,7 +255,8 @@ class Coordinates:
         -------
         casadi.Function
         """
-        highest = max(0, self.order(ca.vertcat(*(ca.vec(e) for e in expressions))))
+        free = ca.Function("expressions", [], list(expressions), {"allow_free": True}).free_sx()
+        highest = max([0, *map(self.order, free)])
         return ca.Function("expressions", self._arguments(highest, parameters), list(expressions))
 
     def from_function(self, function, parameters=()):

@@ -174,7 +174,9 @@ def _entry(name, value, where="", **details):
         raise SpecificationError(
             f"Parameter {name}{where} is {repr(value)[:150]}.",
             "A parameter must be a finite number, a text, or True or False.",
-            do="Give an index or a name, and look the object up inside the case.",
+            do="Leave the case out."
+            if isinstance(entry, float)
+            else "Give an index or a name, and look the object up inside the case.",
             name=name,
             **details,
         )

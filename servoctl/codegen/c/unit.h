@@ -5,7 +5,8 @@
    PROJECTED       where there is NAME_project, the change of x that restores invariants
    WIDE            where there is NAME_wide, the same for eight points at once
    WORK            for some loops the length of the vector w that NAME_instant, NAME_correction and NAME_rest share: what
-                   depends on t and p alone, the Newton correction, and the other outputs; of NAME_wide as well
+                   depends on t and p alone, the Newton correction, and the other outputs; of NAME_wide as well; for that
+                   of taylor.c it is the vector of NAME_still, what depends on p alone, and NAME_moving
    CORRECTIONS, ...    the tolerances of Newton's method and of continuation in loops.py
 
    and what the file itself names. A file that is read alone takes them from alone.h. */
