@@ -586,18 +586,20 @@ class Monitor:
         strong = np.all(pivots > STRONG * sizes[:count])
         return self.model.reordered(t, jets) if strong else None
 
-    def failed(self, t, x, why, what, do):
+    def failed(self, t, x, why, told, row):
         """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.
 
-        The latter says `what` happened and what to `do`.
+        The latter has `told` what happened and what to do, and of which residual, if of one.
         """
         if self.lost(t, x):
             return self.singular(t, x, why)
+        what, do = told
         return IntegrationStopped(
             f"{what}.",
             "A motion is integrated as far as its solution exists and steps succeed.",
             do=f"{do} The run before this instant is in .run.",
             t=float(t),
+            **({"residual": row} if row else {}),
         )
 
     def singular(self, t, x, why):

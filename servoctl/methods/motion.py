@@ -443,9 +443,10 @@ class Stepping:
 
     def _fail(self, t, x, why):
         """Stop because no step succeeds."""
-        why = "; ".join(dict.fromkeys(filter(None, (*why.split("; "), edge(self.model, t, x)))))
+        place, row = edge(self.model, t, x)
+        why = "; ".join(dict.fromkeys(filter(None, (*why.split("; "), place))))
         what = f"{self.method} stopped at t = {t:.7g} s: {why}"
-        self.motion.stop = self.monitor.failed(t, x, self.rank_lost, what, self.advice)
+        self.motion.stop = self.monitor.failed(t, x, self.rank_lost, (what, self.advice), row)
 
     def _keep_last(self, t, x):
         """Record the last state, unless it is so near a singularity that γ^(s̄) is lost."""

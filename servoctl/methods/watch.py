@@ -359,17 +359,17 @@ class Residuals:
             over = np.abs(residuals) - limit - self.coarse[:, None]
         return np.where(np.isnan(residuals), np.inf, np.nan_to_num(over, nan=-1.0, posinf=np.inf, neginf=-1.0))
 
-    def error(self, t, x, over, step, advice):
+    def error(self, t, x, over, step, advice, last):
         """The error of the residual that is farthest beyond what it may be at t, X = x, in a `step`, in words.
 
-        `advice` is for where why is open.
+        `advice` is for where why is open; X = `last` just before, where x may have no value.
         """
         values, allowed = (part[:, 0] for part in self.values(np.array([t]), x[:, None]))
         worst = int(np.argmax(np.where(over > 0, over / np.maximum(allowed, TINY), -1.0)))
         name, value = self.names[worst], float(values[worst])
         row = next((row for row in self.model.reduction.rows if name.endswith(f"({row.name})")), None)
         what = f"The residual {name!r}" if row is None else f"The rate {name} of the residual {row.name!r}"
-        why = edge(self.model, t, x)
+        why, _ = edge(self.model, t, x if np.isfinite(x).all() else last)
         return IntegrationStopped(
             f"{what} leaves zero at t = {t:.7g} s, to {value:.3g} within a step {step}{why and f': {why}'}.",
             f"The tolerances of the method allow it {allowed[worst]:.1e}; beyond, this is no motion of the program.",
@@ -384,19 +384,19 @@ class Residuals:
 
 
 def edge(model, t, x):
-    """The function in a residual that is at the edge of its domain, or jumps, at t, X = x; "" if there is none."""
+    """The function at the edge of its domain, or that jumps, at t, X = x, and the residual it is in; "" for none."""
     r, m = model.reduction, model.reduction.mechanism
     state = ca.vertcat(*m.q, *(s for k in range(1, r.top) for s in m.q.gamma(k)))
-    rows = [row.expression for row in r.original.values() if row.order < r.top]
-    places = domain_edges(rows) if rows else []
+    rows = [row for row in r.original.values() if row.order < r.top]
+    places = [(row.name, *place) for row in rows for place in domain_edges([row.expression])]
     if not places:
-        return ""
-    arguments = ca.vertcat(*(argument for _, argument, _ in places))
+        return "", ""
+    arguments = ca.vertcat(*(argument for _, _, argument, _ in places))
     f = ca.Function("arguments", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [arguments])
     values = np.array(f(t, x, model.parameters)).ravel()
-    near = [(abs(v - bound), words) for v, (words, _, bound) in zip(values, places, strict=True)]
-    distance, words = min(near, key=lambda pair: np.nan_to_num(pair[0], nan=np.inf))
-    return words if distance < EDGE else ""
+    near = [(abs(v - bound), words, row) for v, (row, words, _, bound) in zip(values, places, strict=True)]
+    distance, words, row = min(near, key=lambda place: np.nan_to_num(place[0], nan=np.inf))
+    return (words, row) if distance < EDGE else ("", "")
 
 
 class Watch:
@@ -538,7 +538,7 @@ class Watch:
         if not np.any(over > 0):
             return None
         step = f"of {abs(h):.3g} s by {self.method}"
-        error = residuals.error(float(after), carried, over, step, self.advice)
+        error = residuals.error(float(after), carried, over, step, self.advice, x)
         return End(k, float(t), x, error=error)
 
     def _off(self, t, before, after):
@@ -572,7 +572,7 @@ class Watch:
             middle = (low + high) / 2
             low, high = (low, middle) if np.any(off(middle) > 0) else (middle, high)
         step = f"of {abs(t[1] - t[0]):.3g} s by {self.method}"
-        error = self.residuals.error(float(high), at(high), off(high), step, self.advice)
+        error = self.residuals.error(float(high), at(high), off(high), step, self.advice, at(low))
         return End(k, float(low), at(low), error=error)
 
     def jump(self, model, end):

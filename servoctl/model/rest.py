@@ -194,7 +194,7 @@ def standstill(model, t, chosen):
     """What is open at t [s] while the machine stands still, about the chosen values; None if it moves."""
     rows, equations, aim, x = _at_rest(model, t, chosen)
     q = model.reduction.mechanism.q
-    if not np.abs(equations.scaled(x)).max(initial=0.0) < TOLERANCE:
+    if not np.abs(equations.scaled(x)).max(initial=0.0) < TOLERANCE or not np.isfinite(equations(x)[1]).all():
         return None
     slow = STANDS * (1.0 + np.abs(x[: q.nq]).max())
     x[q.nq :][np.abs(x[q.nq :]) <= slow] = 0.0  # by rounding they would determine directions
