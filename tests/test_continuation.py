@@ -21,6 +21,7 @@ TIP = {  # paths of the tip of an arm with two links of length 1
     "near": lambda t: (0.02, 1.5 * ca.cos(2 * t)),
     "nearer": lambda t: (1e-3, 1.5 * ca.cos(2 * t)),
     "through": lambda t: (ca.SX(0), 1.5 * ca.cos(2 * t)),
+    "cusp": lambda t: (1.0 + 0.1 * ((t - 1) ** 2) ** 0.75, 0.4 + 0 * t),  # with an infinite acceleration at t = 1 s
     "away": lambda t: (1.0 + 0.6 * t, 0.4 + 0 * t),
     "knots": lambda t: sv.paths.spline(t, [0.0, 0.7, 1.1, 3.0], [[1.2, 0.1], [0.3, 0.9], [-0.5, 1.3], [-1.0, -0.8]], 4),
 }
@@ -159,6 +160,21 @@ def test_true_singularities_end_the_plan():
         moved("away", [0.1, 2.9])
     assert caught.value.details["t"] == pytest.approx((np.sqrt(4 - 0.16) - 1) / 0.6, abs=1e-6)
     assert caught.value.details["zero"] == ["b"] and list(caught.value.run.t) == [0.1]
+
+
+@pytest.mark.parametrize("count", [3, 201, 1001])
+def test_a_sample_without_finite_accelerations_ends_the_plan(count, backend):
+    arm.cache_clear()  # a model keeps its compiled functions
+    with refused(sv.IntegrationStopped, "t = 1 s", "power") as caught:
+        sv.simulate(arm("cusp")[0], begin("cusp", 1), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, count))
+    run = caught.value.run
+    assert run.t[-1] < 1.0 and len(run.t) == count // 2 and np.isfinite(run.jets).all()
+
+
+def test_a_plan_of_many_with_such_a_sample_is_not_finished(c_compiler):
+    model, start = arm("cusp")[0], begin("cusp", 1)
+    many = sv.simulate_many(model, start, None, (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, 201))
+    assert many["error"] == ["IntegrationStopped"] and "t = 1 s" in many["message"][0]
 
 
 def test_a_step_does_not_jump_over_the_zero_of_a_pivot():

@@ -466,6 +466,9 @@ class _Path:
         a, b = y[..., size:], other[..., size:]
         return bool(np.all(a * b >= STEADY * np.maximum(a * a, b * b)))
 
+    def _finite(self, y):
+        return bool(np.isfinite(y[..., : y.shape[-1] - self._pivots]).all())
+
     def step(self, t, end, h, least, point):
         """One step of at most the length h: the time reached, the next length and the point, None if h vanishes."""
         while True:
@@ -476,7 +479,7 @@ class _Path:
             following, first = self.correct(now, self._predict(now - t, *point), CONTRACTION)
             if following is not None and self._steady(point[1], following[1]):
                 allowed = _tolerance(point[0], following[0])
-                error = max(first, _distance(point[0], self._predict(t - now, *following)))
+                error = np.maximum(first, _distance(point[0], self._predict(t - now, *following)))  # NaN if one is
                 if error <= allowed:
                     growth = min(2.0, 0.9 * np.sqrt(allowed / (error + ROUNDING)))
                     return now, max(growth, 0.5) * length if growth < 1 else max(h, growth * length), following
@@ -486,7 +489,8 @@ class _Path:
         """The point at t between two nodes: predicted by both, else reached by steps from the first."""
         x, y = np.split(a[1:], [self._n_x])
         point, first = self.correct(t, _hermite(np.asarray(t), a, b, self._n_x), CONTRACTION)
-        if point is not None and first <= _tolerance(x, b[1 : 1 + self._n_x]) and self._steady(y, point[1]):
+        near = point is not None and first <= _tolerance(x, b[1 : 1 + self._n_x])
+        if near and self._steady(y, point[1]) and self._finite(point[1]):
             return point
         now, h, point = a[0], abs(t - a[0]), (x, y)
         while now != t and point is not None:
@@ -510,4 +514,4 @@ class _Path:
                 return False
             x += y[:, :n]
             before = CONTRACTION * defect
-        return correction() <= CORRECTED and self._steady(a[:, 1 + n :], y)
+        return correction() <= CORRECTED and self._steady(a[:, 1 + n :], y) and self._finite(y)

@@ -92,6 +92,7 @@ class Deviations:
         log = np.empty((MOST_ALONG, 1 + f * (n_x + f)))
         self._task[-2] = log.ctypes.data
         steps = self._call("deviations")
+        self._task[-2] = 0  # the log lives no longer than this call
         if steps < 0:
             return None
         t, Q, R = np.split(log[:steps], [1, 1 + f * n_x], axis=1)
@@ -134,7 +135,7 @@ def growth(Z, count, settings):
     """
     f, n_x, S = Z.shape
     of_vectors = n_x**2 + f * n_x * (f + 1) // 2 + (f + 1) * (n_x + 1)
-    others = 8 + n_x * (n_x + 3) + (3 * f + 1) * padded(f)
+    others = 8 + n_x * (n_x + 3) + (2 * f + 1) * padded(f)
     work = np.empty(2 * S * (f * (n_x + f) + count) + 8 * of_vectors + others)
     settings, scale, within = np.array(settings), np.full(n_x, np.nan), np.full(count, np.nan)
     sizes, call = map(ctypes.c_int64, (count, n_x, f)), of_any_size("growth", "growth")

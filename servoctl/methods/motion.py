@@ -104,8 +104,8 @@ class Motion:
     def end_before(self, t, error):
         """Drop the samples from an instant t [s] on, and stop there for an error."""
         k = int(np.flatnonzero(self.t == t)[0])
+        self.stop = error  # first: if Ctrl-C comes between the two, the same samples are cut again
         self.pieces = [(model, first, a, min(b, k)) for model, first, a, b in self.pieces if a < k]
-        self.stop = error
 
     def changes_pivots(self, t):
         """Note a change of pivots at t; how many were made at this instant already and did not help."""

@@ -174,7 +174,7 @@ static inline void add(int64_t S, double factor, const double *restrict from, do
 }
 
 /* ln of the norm of A(t) B(s), from the trace of (Y'Y)^(2^squarings), which exceeds that of the largest eigenvalue F times
-   at most; of a norm below `least` fewer squarings do, as they bound it. work has (3 F + 1) PADDED(F) numbers. */
+   at most; of a norm below `least` fewer squarings do, as they bound it. work has (2 F + 1) PADDED(F) numbers. */
 static double log_norm(int64_t F, const double *A, const double *B, double squarings, double least, double *work)
 {
     const int64_t S = PADDED(F);
@@ -219,7 +219,7 @@ static int quiet(int64_t n, int64_t F, const double *within, const Settings *s)
 /* Whether deviations Z (F, n_x, PADDED(n)) from a motion at n instants, those at the first of them moved on, tell that its
    internal dynamics are not unstable. Growth is that of the states x_i/scale_i; `within` is as for `quiet`, where all other
    growth is less. 0 as well beyond moderate propagators, of which products with inverses lose digits. work has the numbers
-   of W_LANES + 2 n PADDED(n) + 2 PADDED(n) F (n_x + F) + n_x (n_x + 3) + 3 F PADDED(F) + PADDED(F)
+   of W_LANES + 2 n PADDED(n) + 2 PADDED(n) F (n_x + F) + n_x (n_x + 3) + (2 F + 1) PADDED(F)
    + W_LANES (n_x^2 + F n_x (F + 1)/2 + (F + 1) (n_x + 1)). */
 int64_t FN(growth)(int64_t n, int64_t n_x, int64_t F, const double *Z, const Settings *settings, double *work,
                    double *scale, double *within)

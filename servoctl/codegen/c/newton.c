@@ -156,7 +156,8 @@ static int point(double t, const double *a, const double *b, const double *p, do
                                                                  + s / 2 * h * a[1 + 3 * NX + i]))
              + s3 * ((1 + r * (3 + 6 * r)) * b[1 + i] - r * h * ((1 + 3 * r) * b[1 + 2 * NX + i]
                                                                  - r / 2 * h * b[1 + 3 * NX + i]));
-    if (correct(t, x, p, CONTRACTION, y, &first, count) && first <= tolerance(a + 1, b + 1) && steady(a + 1 + NX, y)) return 1;
+    if (correct(t, x, p, CONTRACTION, y, &first, count) && first <= tolerance(a + 1, b + 1) && steady(a + 1 + NX, y)
+        && all_finite(NY - PIVOTS, y)) return 1;
     double now = *a, length = fabs(t - now);
     for (int64_t i = 0; i < NX; i++) x[i] = a[1 + i];
     for (int64_t i = 0; i < NY; i++) y[i] = a[1 + NX + i];
@@ -219,6 +220,9 @@ static int block(int64_t n, int64_t k, const double *t, const double *const *a, 
     *count += 8;
     if (w_any(~(wide_relative(size, y) <= CORRECTED))) return 0;
     FN(wide_rest)(now, x, p, y, w);
+    W sum = ALL(0.0);
+    for (int64_t i = NX; i < NY - PIVOTS; i++) sum += y[i] * 0.0;
+    if (w_any(sum != 0)) return 0; /* a rate is not finite */
     for (int64_t i = NY - PIVOTS; i < NY; i++) {
         const W other = gather(a, 1 + NX + i), product = y[i] * other;
         if (w_any(~((product >= STEADY * y[i] * y[i]) & (product >= STEADY * other * other)))) return 0;

@@ -21,6 +21,14 @@
 #define FN(suffix) GLUED(NAME, suffix) /* NAME_suffix: a function that is called from outside */
 #define INLINE static inline __attribute__((always_inline))
 
+/* Whether numbers are finite. */
+static inline int all_finite(int64_t count, const double *x)
+{
+    double sum = 0;
+    for (int64_t i = 0; i < count; i++) sum += x[i] * 0;
+    return sum == 0;
+}
+
 #include "inline_sine.h"
 #include "inverse_erf.h"
 

@@ -51,14 +51,6 @@ static double tolerance(const double *y, const double *x, int64_t invariant, con
     return sum;
 }
 
-/* Whether numbers are finite. */
-static int all_finite(int64_t count, const double *x)
-{
-    double sum = 0;
-    for (int64_t i = 0; i < count; i++) sum += x[i] * 0;
-    return sum == 0;
-}
-
 static inline double last_end(const Steps *s) { return s->ends[(int64_t)s->count - 1]; }
 
 /* Whether rows determine the rates of samples of the whole span that are no farther apart than the distance. */
