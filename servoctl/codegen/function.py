@@ -379,7 +379,8 @@ class Compiled:
         Returns
         -------
         z : (n_y - pivots, K) array
-            Solutions x at the first K times, dx/dt, d²x/dt² and others; K < N if the iteration fails at t[K].
+            Solutions x at the first K times, dx/dt, d²x/dt² and others; K < N if the iteration fails at t[K], or a rate
+            is not finite there.
         iterations : int
             Number of evaluations.
         """

@@ -192,8 +192,8 @@ static double largest_of(W a)
 }
 
 /* The solutions at the eight times from t[k] on, each between the nodes a and b: as `point` predicts them, corrected
-   together, by the first outputs alone until the correction is small. Returns 1 if all converge; then the log holds
-   them. */
+   together, by the first outputs alone until the correction is small. Returns 1 if all converge, to
+   finite rates; then the log holds them. */
 static int block(int64_t n, int64_t k, const double *t, const double *const *a, const double *const *b, double allowed,
                  const W *p, double *log, int64_t *count)
 {
@@ -220,16 +220,17 @@ static int block(int64_t n, int64_t k, const double *t, const double *const *a, 
     *count += 8;
     if (w_any(~(wide_relative(size, y) <= CORRECTED))) return 0;
     FN(wide_rest)(now, x, p, y, w);
-    W sum = ALL(0.0);
-    for (int64_t i = NX; i < NY - PIVOTS; i++) sum += y[i] * 0.0;
-    if (w_any(sum != 0)) return 0; /* a rate is not finite */
     for (int64_t i = NY - PIVOTS; i < NY; i++) {
         const W other = gather(a, 1 + NX + i), product = y[i] * other;
         if (w_any(~((product >= STEADY * y[i] * y[i]) & (product >= STEADY * other * other)))) return 0;
     }
     for (int64_t i = 0; i < NX; i++) w_store(log + i * n + k, x[i]);
-    for (int64_t i = NX; i < NY - PIVOTS; i++) w_store(log + i * n + k, y[i]);
-    return 1;
+    W sum = ALL(0.0); /* NaN where a rate is not finite */
+    for (int64_t i = NX; i < NY - PIVOTS; i++) {
+        w_store(log + i * n + k, y[i]);
+        sum += y[i] * 0.0;
+    }
+    return !w_any(sum != 0);
 }
 #endif
 
