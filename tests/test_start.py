@@ -386,6 +386,24 @@ def test_a_car_at_rest_whose_speed_is_free_is_told_to_start_in_motion():
     assert caught.value.details["rates"] == ("dx",)
 
 
+def test_a_car_at_rest_is_not_told_to_swing_what_hangs_on_it():
+    """A pendulum's rate is free, too, and moves no car."""
+    q = sv.coordinates("x y psi phi")
+    (x, y, psi, phi), (dx, dy, dpsi, _) = q, q.d(1)
+    bob = sv.particle(q, 1.0, ca.vertcat(x + 0.3 * ca.sin(phi), y, -0.3 * ca.cos(phi)))
+    mechanism = sv.Mechanism(
+        q,
+        sv.rigid_body(q, 20.0, (0, 0, 1.5), position=(x, y), rates=(0, 0, dpsi)) + bob,
+        actuators={"drive": (ca.cos(psi), ca.sin(psi), 0, 0), "steer": psi},
+        constraints={"no slip": dx * ca.sin(psi) - dy * ca.cos(psi)},
+        potential=-9.81 * 0.3 * ca.cos(phi),
+    )
+    path = sv.paths.rest_to_rest(q.t, (0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=6)
+    model = sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}, by="actuators"))
+    with refused(sv.SingularProgram, "stands still", "End the motion before", rates=()):
+        sv.simulate(model, model.start(t=4.5), (4.5, 6.0))
+
+
 def test_a_path_beyond_the_reach_of_an_arm_is_told_to_keep_within():
     """Unit links reach 2 m, where the arm is stretched out."""
     q = sv.coordinates("a b")

@@ -38,7 +38,7 @@ class Standstill:
     rows : tuple of str
         These constraints.
     rates : tuple of str
-        Velocities that no constraint determines: with one of them the machine may start in motion.
+        Velocities in the constraints that these do not determine: with one of them the machine may start in motion.
     """
 
     coordinates: tuple
@@ -207,7 +207,9 @@ def standstill(model, t, chosen):
     if not coordinates or moving > slow:
         return None
     turning = {rate for name, rate in zip(q.names, q.jet_names(1), strict=False) if q.plain and name in coordinates}
-    rates = tuple(name for name in free if name in q.jet_names(1) and name not in turning)
+    places = filter(None, map(q.where, ca.symvar(ca.vertcat(*(row.expression for row in rows)))))
+    bound = {q.jet_names(1)[i] for kind, _, i in places if kind == "w" or kind == "q" and q.plain}
+    rates = tuple(name for name in free if name in bound - turning)
     return Standstill(coordinates, tuple(row for row, names in open_.items() if names), rates)
 
 
