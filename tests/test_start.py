@@ -403,6 +403,8 @@ def test_a_car_at_rest_is_told_so_whatever_swings_on_it():
     for t in (0.1, 4.5):
         with refused(sv.SingularProgram, "stands still", "End the motion before", rates=()):
             sv.simulate(model, model.start(t=t), (t, 6.0))
+    start = model.start(phi=0.3, dphi=1.0)
+    assert [start[name] for name in ("psi", "phi", "dphi", "dx")] == pytest.approx([np.pi / 6, 0.3, 1.0, 0.0], abs=1e-6)
 
 
 def test_a_path_beyond_the_reach_of_an_arm_is_told_to_keep_within():

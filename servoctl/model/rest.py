@@ -273,7 +273,7 @@ def _limit(model, t, held, chosen, still):
         limit[name], error = _extrapolated(*(state[name] for state in states))
         if not error <= NEAR_LIMIT:
             raise still.error(t, moving, dict(zip(states[0].names, states[0].values, strict=True)))
-    _, equations, aim, _ = _at_rest(model, t, limit)
+    _, equations, aim, _ = _at_rest(model, t, {**chosen, **limit})
     x = gauss_newton(equations, aim.reference, aim)
     residual = np.abs(equations.scaled(x)).max(initial=0.0)
     return State(t, x, states[0].names, tuple(held), (), float(residual), at_rest=still.coordinates)
