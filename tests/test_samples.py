@@ -125,6 +125,30 @@ def test_ends_at_rest_of_samples_in_motion_are_told_and_natural_ends_fit():
     assert np.abs(run["pull"] + np.sin(run.t))[inside].max() < 1e-5
 
 
+@pytest.mark.parametrize("k, n", [(2, 200), (2, 3001), (4, 401), (6, 101)])
+def test_a_motion_that_is_brisk_at_its_start_fits_its_samples(k, n):
+    def decay(t):
+        return np.exp(-t / 0.1)
+
+    brisk, turned = samples_of(through(n, decay, 2 * k - 2)), samples_of(through(n, lambda t: decay(6 - t), 2 * k - 2))
+    assert brisk.steepness(k) < 3.0
+    assert turned.steepness(k) < 3.0
+    assert samples_of(through(n, decay, 2 * k - 2, "rest")).steepness(k) > 5.0
+
+
+@pytest.mark.parametrize("n", [32, 40, 60])
+def test_ends_that_make_all_of_a_spline_ring_are_told_as_ends(n):
+    (warning,) = said(through(n, np.sin, 10, "rest"))
+    assert "does not fit its samples at its ends" in warning
+    assert said(through(n, np.sin, 10, "natural")) == []
+
+
+def test_more_samples_are_proposed_where_no_fewer_are_calm():
+    (warning,) = said(through(40, lambda t: np.tanh(5 * (t - 3)), ends="rest"))
+    assert "pass more samples" in warning
+    assert said(through(120, lambda t: np.tanh(5 * (t - 3)), ends="rest")) == []
+
+
 @pytest.mark.parametrize("k", [2, 4, 6])
 def test_the_proposed_smoothness_of_natural_ends_is_the_least_that_fits(k):
     fitting, lower = (samples_of(through(101, np.sin, s)).steepness(k) for s in (2 * k - 2, max(2 * k - 4, 1)))

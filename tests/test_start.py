@@ -386,6 +386,27 @@ def test_a_car_at_rest_whose_speed_is_free_is_told_to_start_in_motion():
     assert caught.value.details["rates"] == ("dx",)
 
 
+def test_a_car_at_rest_is_told_so_whatever_swings_on_it():
+    """A pendulum's rate is free, too, and moves no car; the first motion ends where the car has come to rest."""
+    q = sv.coordinates("x y psi phi")
+    (x, y, psi, phi), (dx, dy, dpsi, _) = q, q.d(1)
+    bob = sv.particle(q, 1.0, ca.vertcat(x + 0.3 * ca.sin(phi), y, -0.3 * ca.cos(phi)))
+    mechanism = sv.Mechanism(
+        q,
+        sv.rigid_body(q, 20.0, (0, 0, 1.5), position=(x, y), rates=(0, 0, dpsi)) + bob,
+        actuators={"drive": (ca.cos(psi), ca.sin(psi), 0, 0), "steer": psi},
+        constraints={"no slip": dx * ca.sin(psi) - dy * ca.cos(psi)},
+        potential=-9.81 * 0.3 * ca.cos(phi),
+    )
+    path = sv.paths.rest_to_rest(q.t, (0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=6)
+    model = sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}, by="actuators"))
+    for t in (0.1, 4.5):
+        with refused(sv.SingularProgram, "stands still", "End the motion before", rates=()):
+            sv.simulate(model, model.start(t=t), (t, 6.0))
+    start = model.start(phi=0.3, dphi=1.0)
+    assert [start[name] for name in ("psi", "phi", "dphi", "dx")] == pytest.approx([np.pi / 6, 0.3, 1.0, 0.0], abs=1e-6)
+
+
 def test_a_path_beyond_the_reach_of_an_arm_is_told_to_keep_within():
     """Unit links reach 2 m, where the arm is stretched out."""
     q = sv.coordinates("a b")

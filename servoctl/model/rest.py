@@ -38,7 +38,7 @@ class Standstill:
     rows : tuple of str
         These constraints.
     rates : tuple of str
-        Velocities that no constraint determines: with one of them the machine may start in motion.
+        Velocities in the constraints that these do not determine: with one of them the machine may start in motion.
     """
 
     coordinates: tuple
@@ -203,12 +203,31 @@ def standstill(model, t, chosen):
     free = free_names(equations, x, aim, {name for names in directions.values() for name in names})
     open_ = {row: [name for name in names if name in free] for row, names in directions.items()}
     coordinates = tuple(dict.fromkeys(name for names in open_.values() for name in names))
-    moving = np.abs(_state_rates(model, t, x)[[name not in coordinates for name in q.names]]).max(initial=0.0)
+    moving = np.abs(_rates_of(model, t, x, rows)[[name not in coordinates for name in q.names]]).max(initial=0.0)
     if not coordinates or moving > slow:
         return None
     turning = {rate for name, rate in zip(q.names, q.jet_names(1), strict=False) if q.plain and name in coordinates}
-    rates = tuple(name for name in free if name in q.jet_names(1) and name not in turning)
+    bound = zip(q.jet_names(1), _bound(q, rows), strict=True)
+    rates = tuple(name for name, inside in bound if inside and name in free and name not in turning)
     return Standstill(coordinates, tuple(row for row, names in open_.items() if names), rates)
+
+
+def _bound(q, rows):
+    """Which velocities are in rows (n,): others, such as that of a pendulum on the machine, move apart from it."""
+    places = [*filter(None, map(q.where, ca.symvar(ca.vertcat(*(row.expression for row in rows)))))]
+    return np.isin(np.arange(q.n), [i for kind, _, i in places if kind == "w" or kind == "q" and q.plain])
+
+
+def _rates_near(model, t, chosen):
+    """What `_rates_of` returns of the state nearest the chosen values."""
+    rows, _, _, x = _at_rest(model, t, chosen)
+    return _rates_of(model, t, x, rows)
+
+
+def _rates_of(model, t, x, rows):
+    """q' at a state; where velocities are q', those in rows alone, and others zero."""
+    q = model.reduction.mechanism.q
+    return _state_rates(model, t, x) * (_bound(q, rows) if q.plain else 1.0)
 
 
 def standstill_near(model, t, chosen):
@@ -220,7 +239,7 @@ def standstill_near(model, t, chosen):
         still = standstill(model, t, chosen)
         if still is not None:
             return t, still
-        before, after = (_state_rates(model, at, _at_rest(model, at, chosen)[3]) for at in (t, t + AFTERWARDS))
+        before, after = (_rates_near(model, at, chosen) for at in (t, t + AFTERWARDS))
         change = after - before
         if not np.any(change):
             return None
@@ -254,7 +273,7 @@ def _limit(model, t, held, chosen, still):
         limit[name], error = _extrapolated(*(state[name] for state in states))
         if not error <= NEAR_LIMIT:
             raise still.error(t, moving, dict(zip(states[0].names, states[0].values, strict=True)))
-    _, equations, aim, _ = _at_rest(model, t, limit)
+    _, equations, aim, _ = _at_rest(model, t, {**chosen, **limit})
     x = gauss_newton(equations, aim.reference, aim)
     residual = np.abs(equations.scaled(x)).max(initial=0.0)
     return State(t, x, states[0].names, tuple(held), (), float(residual), at_rest=still.coordinates)

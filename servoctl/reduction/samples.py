@@ -18,15 +18,19 @@ EDGE = 40  # samples at either end, at most a quarter of all, on which the splin
 ALTERNATING = 0.1  # part of a derivative that alternates from sample to sample, above which it is noise
 MEANT = 1e-2  # of the range of a path: what alternates in the path itself by more is meant
 CALM = 0.03  # part of noise in the differences of fewer samples, up to which these are proposed
-STEEP = 30.0  # size of a derivative at the ends, relative to that between, above which the ends do not fit the samples
+STEEP = 30.0  # size of a derivative, relative to what the samples give, above which the spline's ends do not fit them
 
 
 class Noise(NamedTuple):
-    """Noise of samples: its part of the derivative, its size, and a distance of fewer samples that calms, or 0."""
+    """Noise of samples: its part of the derivative, its size, and a distance of fewer samples that calms, or 0.
+
+    And what alternates in the derivative relative to what noise of that size makes there.
+    """
 
     part: float
     size: float
     stride: int
+    excess: float
 
 
 def warn_of_samples(switches, values, needs, times):
@@ -56,7 +60,7 @@ def warn_of_samples(switches, values, needs, times):
             if len(samples.knots) < LEAST_DENSE or not samples.move():
                 continue
             steep, noise = samples.steepness(k), samples.noise(k)
-            if steep > STEEP:
+            if steep > STEEP or noise is not None and noise.excess > STEEP:
                 ends.append((steep, k, name))
             elif noise is not None:
                 noises.append((noise, k, name))
@@ -73,19 +77,21 @@ def _warn(sentence, found):
 
 
 def _of_noise(names, k, noise):
-    fewer = f"about one in {noise.stride} samples" if noise.stride else "far fewer samples"
+    fit = "fit a spline of fewer pieces to all of them, as docs/own_scene.md does"
+    do = f"Pass about one in {noise.stride} samples to sv.paths.spline, or {fit}."
+    if not noise.stride:
+        do = f"{fit.capitalize()}; where the path itself bends as sharply as they do, pass more samples."
     return (
         f"The samples of the path in {names} do not determine its derivative {k}, which the actuation contains: they "
         f"differ by about {noise.size:.1g} from a smooth curve, as by rounding, noise or corners, which makes up "
-        f"{min(noise.part, 1.0):.0%} of that derivative. Pass {fewer} to sv.paths.spline, or fit a spline of fewer "
-        "pieces to all of them, as docs/own_scene.md does."
+        f"{min(noise.part, 1.0):.0%} of that derivative. {do}"
     )
 
 
-def _of_ends(names, k, steep):
+def _of_ends(names, k, _):
     return (
-        f"The spline of the path in {names} does not fit its samples at its ends: derivative {k}, which the actuation "
-        f"contains, is up to {steep:.1g} times as large there as between. Where the samples begin and end at rest, "
+        f"The spline of the path in {names} does not fit its samples at its ends: from there on its derivative {k}, "
+        "which the actuation contains, swings about that of the samples. Where the samples begin and end at rest, "
         f"write ends='rest' in sv.paths.spline; where they do not, ends='natural' and smoothness={max(2 * k - 2, 2)}, "
         "with samples before and after the motion."
     )
@@ -124,20 +130,34 @@ class Samples:
         between = t if k % 2 == 0 else (t[:, 1:] + t[:, :-1]) / 2  # where what alternates has its extrema
         path, derivative = self._coefficient(t, 0), self._coefficient(between, k)
         size = _left(t, path, DIFFERENCES)
-        part = _left(between, derivative, DIFFERENCES) / (_root_mean_square(derivative) + self._slow(k))
+        alternating = _left(between, derivative, DIFFERENCES)
+        part = alternating / (_root_mean_square(derivative) + self._slow(k))
         if part <= ALTERNATING or size > MEANT * np.ptp(path):
             return None
-        return Noise(float(part), size, self._calm_stride(size, k))
+        made = size * (math.pi / np.diff(t).min()) ** k / math.factorial(k)
+        return Noise(float(part), size, self._calm_stride(size, k), alternating / made)
 
     def steepness(self, k):
-        """The largest derivative k beside the ends, relative to the largest between."""
+        """The largest derivative k beside the ends, relative to those between and of polynomials through the samples.
+
+        A motion that is brisk at an end is so in these, too.
+        """
         last = len(self.knots) - 1
         inner = np.linspace(self.edge, last - self.edge, min(WINDOW * WINDOWS, last - 2 * self.edge)).astype(int)
         ends = np.arange(self.edge // 2)
         t = self._instants(self.knots[np.concatenate([ends, inner, last - ends[::-1]])])
         sizes = np.abs(self._coefficient(np.array([t[:-1], (t[1:] + t[:-1]) / 2]), k)).max(axis=0)
-        between = slice(len(ends), len(t) - len(ends) - 1)
-        return sizes[[*ends, *(-1 - ends)]].max() / (sizes[between].max() + self._slow(k))
+        between = sizes[len(ends) : len(t) - len(ends) - 1].max()
+        given = max(self._divided(k, self.knots[: self.edge + k]), self._divided(k, self.knots[-self.edge - k :]))
+        return sizes[[*ends, *(-1 - ends)]].max() / (max(between, given) + self._slow(k))
+
+    def _divided(self, k, knots):
+        """The largest divided difference k of consecutive samples: coefficient k of the polynomial through them."""
+        t = self._instants(knots)
+        c = self._coefficient(t, 0)
+        for j in range(1, k + 1):
+            c = np.diff(c) / (t[j:] - t[:-j])
+        return np.abs(c).max()
 
     def _slow(self, k):
         """Coefficient k of a motion of the same stroke in all the time: a derivative may be zero, as of a line."""
