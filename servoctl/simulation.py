@@ -63,6 +63,7 @@ STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no ste
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
 FEW_STEPS = 100  # of a motion, up to which its series tell about growth sooner than a bound does
+BESIDE_ROUND = 0.0137  # of an interval: own samples keep off round numbers, where formulas may be 0/0
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
@@ -189,7 +190,9 @@ def _own_times(method, span, times):
     def own(count):
         if whole and (count - 1) * gap <= length * (1 + SAME_TIME):
             return None
-        return np.union1d(times, np.linspace(*span, count))[:: 1 if span[1] > span[0] else -1]
+        between = np.linspace(*span, count)
+        between[1:-1] += BESIDE_ROUND * (span[1] - span[0]) / count
+        return np.union1d(times, between)[:: 1 if span[1] > span[0] else -1]
 
     return own
 
@@ -232,6 +235,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         bar.close()
 
     def finished():
+        motion.end_where_undefined(str(method))
         end_at_other_orders(motion)
         started = _as_started(model, start, t0, x0 if motion.start is None else motion.start)
         run = _run(model, motion, (method, drift, knots), started, t1)

@@ -52,6 +52,8 @@ def _constructor(cls):
 
 
 def _refuse_change(self, name, *value):
+    if "__dataclass_params__" not in vars(type(self)) and all(f.name != name for f in fields(self)):
+        return (object.__setattr__ if value else object.__delattr__)(self, name, *value)  # of a plain subclass
     raise FrozenInstanceError(f"cannot {'assign to' if value else 'delete'} field {name!r}")
 
 

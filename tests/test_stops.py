@@ -381,3 +381,49 @@ def test_a_motion_of_all_coordinates_stops_where_an_actuator_has_no_lever(name, 
     assert caught.value.details["measure"] < 1e-6 and "actuation" in str(caught.value)
     with refused(sv.SingularProgram, direction=["d2b"], t=0.0):
         sv.simulate(*lifted(name, dead), (0.0, 0.3), method)
+
+
+UNDEFINED = {  # no value of the formulas at t = 1 s, where they have limits
+    "power": lambda t: 0.1 * ((t - 1.0) ** 2) ** 1.25,
+    "quotient": lambda t: 0.1 * ca.sin(t - 1.0) / (t - 1.0),
+}
+
+
+def pulled_along(path):
+    """A cart along a path, with a pendulum on it."""
+    q = sv.coordinates("x th")
+    x, th = q
+    functions = sv.particle(q, 1.0, ca.vertcat(x, 0)) + sv.particle(q, 0.5, ca.vertcat(x + ca.sin(th), -ca.cos(th)))
+    mechanism = sv.Mechanism(q, functions, potential=-0.5 * 9.81 * ca.cos(th), actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"X": x - path(q.t)}, by="actuators"))
+    return model, model.start(th=0.2, dth=0.0)
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA", "BDF"])
+@pytest.mark.parametrize("name", UNDEFINED)
+def test_no_sample_is_without_finite_accelerations(name, method):
+    model, start = pulled_along(UNDEFINED[name])
+    with refused(sv.IntegrationStopped, "d2x", "d2th", "t_eval", t=1.0, residual="X") as caught:
+        sv.simulate(model, start, (0.0, 2.0), method)
+    run = caught.value.run
+    assert np.isfinite(run.jets).all() and 0.99 < run.t[-1] < 1.0 and not run.success
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA"])
+@pytest.mark.parametrize("name", UNDEFINED)
+def test_an_instant_without_finite_accelerations_is_left_out(name, method):
+    """The force on the cart in front of the gap and behind it, from x'' of the path."""
+    model, start = pulled_along(UNDEFINED[name])
+    run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 0.5, 1.5, 2.0])
+    assert run.success and np.isfinite(run.jets).all()
+    d2x = np.array([float(ca.evalf(ca.substitute(second, t, at))) for at in run.t for t, second in [twice(name)]])
+    th, dth, d2th = run["th"], run["dth"], run["d2th"]
+    force = 1.5 * d2x + 0.5 * (d2th * np.cos(th) - dth**2 * np.sin(th))
+    assert run["F"] == pytest.approx(force, abs=1e-8)
+    assert np.cos(th) * d2x + d2th + 9.81 * np.sin(th) == pytest.approx(0.0, abs=1e-8)
+
+
+def twice(name):
+    """Time and x''(t) of a path, by CasADi."""
+    t = ca.SX.sym("t")
+    return t, ca.jacobian(ca.jacobian(UNDEFINED[name](t), t), t)

@@ -7,7 +7,7 @@ import pickle
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import FrozenInstanceError, dataclass, field, replace
+from dataclasses import FrozenInstanceError, dataclass, field, fields, replace
 
 import casadi as ca
 import numpy as np
@@ -253,6 +253,20 @@ def test_frozen_values_are_what_frozen_dataclasses_are():
         with pytest.raises(TypeError, match="unhashable"):
             hash(a)
         assert hash(replace(a, items=())) == hash(replace(b, items=()))
+
+
+def test_a_plain_subclass_of_a_frozen_value_has_attributes_of_its_own():
+    class Named(made_by(frozen)):
+        def __init__(self, *values, label):
+            super().__init__(*values)
+            self.label = label
+
+    value = Named("a", label="mine")
+    assert value.label == "mine"
+    del value.label
+    for name in (f.name for f in fields(value)):
+        with pytest.raises(FrozenInstanceError):
+            setattr(value, name, 1.0)
 
 
 def test_frozen_values_keep_what_their_class_defines():

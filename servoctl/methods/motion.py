@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.errors import ServoError
+from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.methods.choice import MinimalCoordinates, Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
@@ -106,6 +106,25 @@ class Motion:
         k = int(np.flatnonzero(self.t == t)[0])
         self.stop = error  # first: if Ctrl-C comes between the two, the same samples are cut again
         self.pieces = [(model, first, a, min(b, k)) for model, first, a, b in self.pieces if a < k]
+
+    def end_where_undefined(self, method):
+        """Stop before the first sample at which a jet has no finite value, as 0/0, also where it has a limit."""
+        if np.isfinite(self.jets).all():
+            return
+        k = int(np.flatnonzero(~np.isfinite(self.jets).all(axis=0))[0])
+        model, t = next(model for model, _, _, end in self.pieces if k < end), float(self.t[k])
+        names = [name for name, value in zip(model.jet_names, self.jets[:, k], strict=False) if not np.isfinite(value)]
+        states = self.jets[: len(model.state_names), max(k - 1, 0) : k + 1]
+        why, row = edge(model, t, states[:, -1 if np.isfinite(states[:, -1]).all() else 0])
+        error = IntegrationStopped(
+            f"{method} stopped at t = {t:.7g} s: no finite value of {', '.join(names) or 'a jet'}{why and f'; {why}'}.",
+            "Samples of a motion have finite coordinates, velocities and accelerations.",
+            do="Write what the program prescribes so that it and its derivatives have values there, also as limits, or "
+            "leave this instant out of t_eval. The run before it is in .run.",
+            t=t,
+            **({"residual": row} if row else {}),
+        )
+        self.end_before(self.t[k], error)
 
     def changes_pivots(self, t):
         """Note a change of pivots at t; how many were made at this instant already and did not help."""
