@@ -619,7 +619,10 @@ def sample_times(t0, t1, t_eval, knots, method=None):
         low, high = (-np.inf, np.inf) if window else (min(t0, t1), max(t0, t1))
         margin = SAME_TIME * max(1.0, abs(t0), abs(t1))
         if not times.size or times[0] < low - margin or times[-1] > high + margin:
-            covered = f"covers {times[0]:g} to {times[-1]:g} s" if times.size else "is empty"
+            covered = "is empty"
+            if times.size:
+                beyond = max(low - times[0], times[-1] - high)
+                covered = f"covers {times[0]:g} to {times[-1]:g} s, up to {beyond:.2g} s beyond t_span"
             raise SpecificationError(
                 f"t_eval {covered}.",
                 f"Samples lie within t_span, {min(t0, t1):g} to {max(t0, t1):g} s.",
