@@ -103,9 +103,18 @@ class Motion:
 
     def end_before(self, t, error):
         """Drop the samples from an instant t [s] on, and stop there for an error."""
-        k = int(np.flatnonzero(self.t == t)[0])
         self.stop = error  # first: if Ctrl-C comes between the two, the same samples are cut again
-        self.pieces = [(model, first, a, min(b, k)) for model, first, a, b in self.pieces if a < k]
+        self._cut(int(np.flatnonzero(self.t == t)[0]))
+
+    def end_after(self, t, error):
+        """Drop the samples after an instant t [s], and stop there for an error."""
+        self.stop, times = error, self.t
+        if len(times) > 1:
+            self._cut(int(np.sum(times <= t if times[-1] > times[0] else times >= t)))
+
+    def _cut(self, count):
+        """Keep the first samples alone."""
+        self.pieces = [(model, first, a, min(b, count)) for model, first, a, b in self.pieces if a < count]
 
     def end_where_undefined(self, method):
         """Stop before the first sample at which a jet has no finite value, as 0/0, also where it has a limit."""
@@ -457,7 +466,7 @@ class Stepping:
                 self._go_on(variant, t, x)
                 return True
             outcome = outcome.otherwise
-        self.motion.stop = self.monitor.singular(outcome.t, outcome.x, outcome.why)
+        self.motion.end_after(outcome.t, self.monitor.singular(outcome.t, outcome.x, outcome.why))
         return False
 
     def _fail(self, t, x, why):
