@@ -14,7 +14,7 @@ from servoctl.codegen.emit import emit, operations
 from servoctl.codegen.function import CALLS
 from servoctl.methods.taylor import taylor_coefficients
 
-LAST = 48  # index of Taylor coefficients at which the function has 24,000 operations
+LAST = 64  # index of Taylor coefficients at which the function has 24,000 operations
 CALL, BUFFER = "casadi Function.__call__ of compiled code", "casadi FunctionBuffer of compiled code"
 COLUMN, ARRAYS = (ctypes.c_double, *3 * [ctypes.c_void_p]), (*4 * [ctypes.c_void_p], ctypes.c_int)
 
