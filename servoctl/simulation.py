@@ -63,7 +63,7 @@ STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no ste
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
 FEW_STEPS = 100  # of a motion, up to which its series tell about growth sooner than a bound does
-BESIDE_ROUND = 0.0137  # of an interval: own samples keep off round numbers, where formulas may be 0/0
+BESIDE_ROUND = 1e-3  # of an interval: own samples keep off round numbers, where formulas may be 0/0
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 

@@ -121,6 +121,8 @@ class Motion:
         if np.isfinite(self.jets).all():
             return
         k = int(np.flatnonzero(~np.isfinite(self.jets).all(axis=0))[0])
+        if self.stop is not None and k == len(self.t) - 1:  # the stop that follows says why
+            return self._cut(k)
         model, t = next(model for model, _, _, end in self.pieces if k < end), float(self.t[k])
         names = [name for name, value in zip(model.jet_names, self.jets[:, k], strict=False) if not np.isfinite(value)]
         states = self.jets[: len(model.state_names), max(k - 1, 0) : k + 1]
