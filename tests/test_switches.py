@@ -15,6 +15,7 @@ import servoctl as sv
 from servoctl.jets.series import Series
 from servoctl.jets.tape import REAL, Tape
 from servoctl.model.switching import switching
+from servoctl.simulation import simulated
 
 ONE_STEP = ("DOP853", "RK45", "Radau", "LSODA", "Taylor", "RadauIIA", "RK4", "RK8")
 MULTISTEP = ("BDF", "CVODES", "IDAS")  # at their default rtol of 1e-9 the smooth motion itself errs by 1e-7
@@ -473,6 +474,14 @@ def narrow_reference(name):
 def test_no_method_steps_over_a_narrow_force(name, method):
     force, start, span = NARROW[name]
     run = sv.simulate(*pushed(force, *start), span, method, t_eval=span)
+    assert [run["y"][-1], run["dy"][-1]] == pytest.approx(narrow_reference(name), abs=2e-6)
+
+
+@pytest.mark.parametrize("name", NARROW)
+def test_intervals_between_samples_hide_no_flank(name):
+    """CVODES between two samples alone, without those of the verdict on growth."""
+    force, start, span = NARROW[name]
+    run = simulated(*pushed(force, *start), span, "CVODES", t_eval=span)
     assert [run["y"][-1], run["dy"][-1]] == pytest.approx(narrow_reference(name), abs=2e-6)
 
 

@@ -17,7 +17,7 @@ from servoctl.methods.motion import Cubics
 from servoctl.values import frozen
 
 WATCHED = 1000  # intervals of a span at whose ends pivots are inspected, beside the samples
-SLACK = 0.5  # times the change of the rates over an interval, by which its cubic may miss them
+SLACK = 0.25  # times the change of the rates over an interval, by which its cubic may miss them
 MOST_STEPS = 20_000  # between two instants of the grid
 SOLVERS = {"CVODES": "cvodes", "IDAS": "idas"}
 COUNTS = {"steps": "nsteps", "nfev": "nfevals", "nlu": "nlinsetups"}
