@@ -15,6 +15,7 @@ from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_ord
 CONVOLUTIONS = {"mul": 1.0, "div": 1.0, "quad": 1.0, "power": 1.0, "sq": 0.5, "sqrt": 0.5}  # in an operation
 
 
+@lru_cache(4)  # the same for all functions of one model
 def solved_for(equations):
     """Velocities that rows determine: for each level below s̄ rows, the entries of γ^(k) they give, and pivots.
 
@@ -45,7 +46,7 @@ def _watched(pivot, equations):
     return not ca.symvar(pivot) or any(vanish(v) for o in others for v in spread([pivot - o, pivot + o]))
 
 
-@lru_cache(4)  # the same for all functions of one model
+@lru_cache(4)
 def in_independent(equations):
     """The rows with what rows of order 0 and 1 determine put into the others, their L, and the stage of these others.
 

@@ -583,8 +583,7 @@ class Monitor:
         count = len(self.model.row_pivots)
         pivots = np.abs(self.model.pivots_at(t, jets)[:count])
         sizes = self.model.pivot_sizes if self.reference is None else self.reference
-        strong = np.all(pivots > STRONG * sizes[:count])
-        return self.model.reordered(t, jets) if strong else None
+        return self.model.reordered(t, jets) if np.all(pivots > STRONG * sizes[:count]) else None
 
     def failed(self, t, x, why, told, row):
         """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.

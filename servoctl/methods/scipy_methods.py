@@ -132,7 +132,7 @@ class ScipySteps(BulkSteps):
             return False
         mark, self.mark = self.mark, self.solver.t
         near = abs(self.mark - mark) < CREEPS * self.watch.span
-        return near and edge(self.model, self.solver.t, self.solver.y) != ("", "")
+        return near and edge(self.model, self.solver.t, self.solver.y)[0] != ""
 
     def _project(self):
         s = self.solver
