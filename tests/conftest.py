@@ -1,8 +1,17 @@
-"""Models that are derived once for all tests, and numbers from expressions."""
+"""Models that are derived once for all tests, numbers from expressions, and the first tier.
+
+`pytest` runs the first tier, `pytest --all` every test; a file or a test that is named is run whole. The first tier is
+the first case of each function that `tests/left.txt` does not list. A line of that list is a test function, or a file
+that is not even imported; `tests/tiers.py` measures and writes it, so that a new test is in the first tier until it is
+found to be slow.
+"""
 
 import os
 import sys
 import warnings
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when casadi is imported; matrices are small, and threads would wait
 
 import casadi as ca
 import numpy as np
@@ -105,6 +114,11 @@ def pendulum(unit=1.0, guess=True):
     return sv.derive(mechanism, program, guess={"y": -unit} if guess else {}, keep=["x", "y"])
 
 
+def needs(module):
+    """A module of an extra, or a skip that says which one."""
+    return pytest.importorskip(module, reason=f"needs {module}, which is in the extra 'test-all'")
+
+
 def words(text):
     """The text without its line breaks."""
     return " ".join(text.split())
@@ -150,8 +164,59 @@ def signal(model, kind, t, jets):
     return dict(zip(names, function(t, jets, model.parameters), strict=True))
 
 
-def pytest_collection_modifyitems(items):
-    """Tests with "RadauIIA" among their parameters use the compiler: its steps are C code."""
+# tiers ---------------------------------------------------------------------------------------------------------------
+
+TESTS = Path(__file__).parent
+LEFT = TESTS.joinpath("left.txt").read_text(encoding="utf-8").split()
+FURTHER = pytest.StashKey()  # how many cases the first tier leaves of its functions; None where everything is run
+
+
+def pytest_addoption(parser):
+    """`--all`."""
+    parser.addoption("--all", action="store_true", help="every test, where no file or test is given (CONTRIBUTING.md)")
+
+
+def pytest_configure(config):
+    """The first tier is what runs where neither `--all` nor a file or test is given."""
+    given = [config.invocation_params.dir / argument for argument in config.args]
+    config.stash[FURTHER] = 0 if given == [TESTS] and not config.option.all else None
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Files that the first tier leaves are not imported."""
+    if config.stash[FURTHER] is not None and collection_path.relative_to(TESTS).as_posix() in LEFT:
+        return True
+
+
+def pytest_collection_modifyitems(config, items):
+    """Take the first tier; tests with "RadauIIA" among their parameters use the compiler, as its steps are C code."""
+    if config.stash[FURTHER] is not None:
+        left = {f"tests/{name}" for name in LEFT}
+        first = {item.nodeid.partition("[")[0]: item for item in reversed(items)}
+        kept = [item for name, item in reversed(first.items()) if name not in left]
+        config.stash[FURTHER] = len(items) - len(first)
+        items[:] = kept
     for item in items:
         if "RadauIIA" in item.name and hasattr(item, "fixturenames"):
             item.fixturenames.append("c_compiler")
+
+
+def pytest_sessionfinish(session):
+    """A worker of xdist tells what it left."""
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["further"] = session.config.stash[FURTHER]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    """What a worker of xdist told; they all collect the same."""
+    node.config.stash[FURTHER] = getattr(node, "workeroutput", {}).get("further")
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """Say what the first tier left."""
+    further = config.stash[FURTHER]
+    if further is not None:
+        files = sum("::" not in name for name in LEFT)
+        left = f"{len(LEFT) - files} slow functions, {files} files and {further} further cases"
+        terminalreporter.write_line(f"The first tier of the tests; left to pytest --all: {left} of its functions.")

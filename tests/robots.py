@@ -5,6 +5,8 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+import pytest
+from conftest import needs
 
 OWN = Path(__file__).parents[1] / "examples" / "robots"
 PUBLIC = {
@@ -16,14 +18,14 @@ PUBLIC = {
 
 
 def file_of(name):
-    """The path of a robot's file, or None where example-robot-data is not installed."""
+    """The path of a robot's file; the test is skipped where it needs example-robot-data and this is not installed."""
     if name not in PUBLIC:
         return str(OWN / f"{name}.urdf")
     found = find_spec("cmeel")
-    if found is None:
-        return None
-    root = Path(found.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots"
-    return str(root / PUBLIC[name]) if (root / PUBLIC[name]).exists() else None
+    path = found and Path(found.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots" / PUBLIC[name]
+    if path is None or not path.exists():
+        pytest.skip("needs example-robot-data, which is in the extra 'test-all'")
+    return str(path)
 
 
 TWIST, PLACE = ("vx", "vy", "vz", "wx", "wy", "wz"), ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -33,8 +35,7 @@ class Pinocchio:
     """A robot in pinocchio, with states given in the names of servoctl."""
 
     def __init__(self, robot, path, base):
-        import pinocchio
-
+        pinocchio = needs("pinocchio")
         self.pin, self.robot = pinocchio, robot
         free = (pinocchio.JointModelFreeFlyer(),) if base == "free" else ()
         self.model = pinocchio.buildModelFromUrdf(path, *free, mimic=True)

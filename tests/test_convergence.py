@@ -7,6 +7,7 @@ import casadi as ca
 import closed_forms as cf
 import numpy as np
 import pytest
+from conftest import needs
 from refusals import refused, warned
 from scipy.integrate import solve_ivp
 
@@ -342,7 +343,7 @@ def test_a_stopped_run_is_saved_too(gallery_model, tmp_path):
 
 
 def test_runs_become_datasets(gallery_model):
-    pytest.importorskip("xarray", reason="xarray is an optional dependency")
+    needs("xarray")
     model = gallery_model("overhead-crane")
     run = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0), t_eval=np.linspace(0, 8, 21))
     data = run.to_xarray()

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from conftest import needs
 
 import servoctl as sv
 import servoctl.shell.main as shell
@@ -118,7 +119,7 @@ def exists(module, name):
 
 @pytest.mark.parametrize("tool", TOOLS)
 def test_the_names_of_each_tool_exist(tool):
-    module = pytest.importorskip(TOOLS[tool], reason=f"{tool} is not installed")
+    module = needs(TOOLS[tool])
     names = list(column(tool))
     assert len(names) > 9
     assert [name for name in names if not exists(module, name)] == []
@@ -126,7 +127,7 @@ def test_the_names_of_each_tool_exist(tool):
 
 @pytest.mark.parametrize("tool", ["SymPy", "Pinocchio", "MuJoCo", "Drake"])
 def test_each_tool_prints_the_same_line(tool, capsys):
-    pytest.importorskip(TOOLS[tool], reason=f"{tool} is not installed")
+    needs(TOOLS[tool])
     by_hand = re.findall(r"```python\n(.*?)```", TEN_LINES, re.S)[1]
     block = re.search(rf"^## {tool}\n\n```py\n(.*?)```", TEN_LINES, re.M | re.S)[1]
     exec(by_hand + block, {})

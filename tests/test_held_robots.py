@@ -1,7 +1,5 @@
 """Accelerations and reactions of held robots against pinocchio's constraintDynamics."""
 
-from importlib.util import find_spec
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ import robots
 
 import servoctl as sv
 
-pytestmark = pytest.mark.skipif(find_spec("pinocchio") is None, reason="pinocchio is not installed")
 LEGS = ("front_left", "front_right", "hind_left", "hind_right")
 STANDING = {"base_z": 0.3} | {f"{leg}_{joint}": angle for leg in LEGS for joint, angle in (("flexion", 0.7), ("knee", -1.4))}
 TALOS = {"base_z": 1.0} | {
@@ -53,8 +50,6 @@ def test_accelerations_of_held_robots_equal_pinocchio(scene):
     """Random velocities that the contacts allow, random torques and pushes, with the damping of the joints."""
     file, base, posture, frames = scene
     path = robots.file_of(file)
-    if path is None:
-        pytest.skip("example-robot-data is not installed")
     robot, random = sv.urdf(path, base=base), np.random.default_rng(1807)
     plant = sv.plant(robot.mechanism(sv.held(robot, frames, posture), friction=0.0))
     other, q = robots.Pinocchio(robot, path, base), robot.q

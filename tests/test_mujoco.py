@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 import robots
+from conftest import needs
 from refusals import refused
 from test_robot_programs import HOME, LEGS, STANDING, arm_plan, place, quadruped_plan
 
 import servoctl as sv
 
-mujoco = pytest.importorskip("mujoco")
+mujoco = needs("mujoco")
 
 
 def model_of(name, step=1e-3, more=0.0):

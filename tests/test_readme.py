@@ -9,6 +9,7 @@ from math import pi
 from pathlib import Path
 
 import pytest
+from conftest import needs
 
 import servoctl as sv
 from servoctl.gallery import cars, crane_3d, gallery, mass_on_car, overhead_crane, passive_arm, vtol
@@ -58,6 +59,8 @@ def test_python_blocks_execute_and_print_what_is_shown(page, tmp_path, monkeypat
     shown, printed, names = blocks(page, "text"), io.StringIO(), {}
     with contextlib.redirect_stdout(printed):
         for block in blocks(page, "python"):
+            for module in re.findall(r"^ *(?:import|from) (\w+)", block, re.M):
+                needs(module)
             exec(compile(block, page.name, "exec"), names)
     assert settled(printed.getvalue()) == settled("".join(shown))
 

@@ -1,7 +1,6 @@
 """Robots under programs: held frames, closed chains, poses; plans verified, and forces equal to pinocchio's."""
 
 from functools import lru_cache
-from importlib.util import find_spec
 
 import casadi as ca
 import numpy as np
@@ -73,7 +72,6 @@ def test_a_pose_program_of_six_axes_is_flat_and_verified():
     assert sv.verify(model, run).verdict == "passed"
 
 
-@pytest.mark.skipif(find_spec("pinocchio") is None, reason="pinocchio is not installed")
 def test_torques_of_the_arm_equal_pinocchio():
     arm, mechanism, _, run = arm_plan()
     other = robots.Pinocchio(arm, robots.file_of("six_axis_arm"), "fixed")
@@ -84,7 +82,6 @@ def test_torques_of_the_arm_equal_pinocchio():
         assert np.abs(ours - wanted).max() < 1e-12 * np.abs(wanted).max()
 
 
-@pytest.mark.skipif(find_spec("pinocchio") is None, reason="pinocchio is not installed")
 def test_least_torques_of_a_standing_quadruped_equal_pinocchio():
     robot, mechanism, model, run = quadruped_plan()
     assert len(mechanism.constraints) == 12
@@ -122,8 +119,6 @@ def test_a_four_bar_is_closed_in_its_plane():
     start = model.start(guess={"crank_joint": -1.0, "coupler_joint": 1.0, "rocker_joint": -1.2})
     run = sv.simulate(model, start, (0.0, 2.0))
     assert sv.verify(model, run).verdict == "passed"
-    if find_spec("pinocchio") is None:
-        return
     other = robots.Pinocchio(arm, robots.file_of("four_bar"), "fixed")
     rows = (ends[0].jacobian - ends[1].jacobian)[[0, 2], :]
     jacobian = ca.Function("J", [ca.vertcat(*arm.q)], [ca.densify(rows)])
@@ -160,8 +155,6 @@ def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
     run = sv.simulate(model, model.start(guess=home), (0.0, 1.5))
     assert model.flat
     assert sv.verify(model, run).verdict == "passed"
-    if find_spec("pinocchio") is None:
-        return
     other = robots.Pinocchio(robot, str(path), "fixed")
     rows = (ends[0].jacobian - ends[1].jacobian)[[0, 2], :]
     jacobian = ca.Function("J", [ca.vertcat(*robot.q)], [ca.densify(rows)])

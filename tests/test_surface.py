@@ -6,12 +6,14 @@ import os
 import re
 import subprocess
 import sys
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
 import casadi as ca
 import pytest
+from conftest import needs
 
 import servoctl as sv
 from servoctl.gallery import gallery
@@ -40,9 +42,14 @@ def layer(path):
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+@cache
+def parsed(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports(path):
     """Modules that a file imports anywhere, `from servoctl import spec` as servoctl.spec."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -53,8 +60,12 @@ def imports(path):
                 yield node.module
 
 
-own_files = pytest.mark.parametrize("path", FILES, ids=relative)
-layered = pytest.mark.parametrize("path", [f for f in FILES if relative(f) not in ENTRIES], ids=relative)
+LAYERED = [path for path in FILES if relative(path) not in ENTRIES]
+
+
+def offenders(fault, files=FILES):
+    """What a function says of each file, by the file's name, where it says anything."""
+    return {relative(path): said for path in files if (said := fault(path))}
 
 
 # names and documentation ---------------------------------------------------------------------------------------------
@@ -104,12 +115,13 @@ def public():
 PUBLIC = dict(public())
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_a_public_name_is_documented(name):
-    text = inspect.getdoc(PUBLIC[name])
-    assert text
+def begins_with_a_sentence(text):
     first = text.split("\n\n")[0]
-    assert first.endswith((".", ":")) and first[0] == first[0].upper() or first[0] in "qwrγφ"
+    return first.endswith((".", ":")) and first[0] == first[0].upper() or first[:1] in tuple("qwrγφ")
+
+
+def test_public_names_are_documented():
+    assert [name for name, thing in PUBLIC.items() if not begins_with_a_sentence(inspect.getdoc(thing) or " ")] == []
 
 
 def documented(text):
@@ -132,13 +144,15 @@ def parameters(thing):
     return [n for n in names if n not in ("self", "cls") and not n.startswith("_")]
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_every_parameter_is_documented(name):
-    wanted, text = parameters(PUBLIC[name]), inspect.getdoc(PUBLIC[name]) or ""
+def undocumented(thing):
+    wanted, text = parameters(thing), inspect.getdoc(thing) or ""
     first = text.split("\n\n")[0]
     said = [n for n in wanted if len(wanted) == 1 and re.search(rf"\b{n}\b", first)]  # "symbols of γ^(k), k >= 1"
-    missing = [n for n in wanted if n not in documented(text) and n not in said]
-    assert not missing, f"{name} does not document {', '.join(missing)}"
+    return [n for n in wanted if n not in documented(text) and n not in said]
+
+
+def test_every_parameter_is_documented():
+    assert {name: missing for name, thing in PUBLIC.items() if (missing := undocumented(thing))} == {}
 
 
 # reprs ---------------------------------------------------------------------------------------------------------------
@@ -152,10 +166,10 @@ def short(value):
     return True
 
 
-@pytest.mark.parametrize("name", gallery)
-def test_specifications_print_in_twelve_lines(name):
-    mechanism, program = gallery[name].build()
-    assert short(mechanism) and short(program) and short(mechanism.q) and short(mechanism.parameters)
+def test_specifications_print_in_twelve_lines():
+    for scene in gallery.values():
+        mechanism, program = scene.build()
+        assert short(mechanism) and short(program) and short(mechanism.q) and short(mechanism.parameters)
 
 
 @pytest.mark.parametrize("name", ["appell-hamel", "crane-3d", "three-cars", "vtol-centre", "constant-speed-horizontal"])
@@ -197,39 +211,42 @@ def test_small_values_print_in_twelve_lines(value):
 # layers and imports --------------------------------------------------------------------------------------------------
 
 
-@layered
-def test_a_module_belongs_to_a_layer(path):
-    assert layer(path) in LAYERS
+def test_modules_belong_to_a_layer():
+    assert [relative(path) for path in LAYERED if layer(path) not in LAYERS] == []
 
 
-@layered
-def test_imports_point_towards_the_specification(path):
-    here = LAYERS.index(layer(path))
+def upward(path):
+    """Imports of a file from a layer above its own; the shell and the gallery alone import the whole package."""
+    here, shows = LAYERS.index(layer(path)), layer(path) in ("shell", "gallery")
     for module in imports(path):
-        parts = module.split(".")
-        if parts == ["servoctl"]:
-            assert layer(path) in ("shell", "gallery"), "only the shell and the gallery import the whole package"
-        elif parts[0] == "servoctl" and parts[1] in LAYERS:
-            assert LAYERS.index(parts[1]) <= here, f"{relative(path)} imports {module}"
-            if layer(path) == "gallery":
-                assert parts[1] in ("errors", "spec", "gallery")
-            if parts[1] == "gallery":
-                assert layer(path) in ("gallery", "shell"), f"{relative(path)} imports the gallery"
+        first, *rest = module.split(".")
+        if first != "servoctl" or (rest and rest[0] not in LAYERS):
+            continue
+        above = LAYERS.index(rest[0]) > here if rest else not shows
+        seen = rest[:1] != ["gallery"] or shows
+        if above or not seen or (layer(path) == "gallery" and rest and rest[0] not in ("errors", "spec", "gallery")):
+            yield module
 
 
-@layered
-def test_casadi_stays_where_equations_are_made(path):
-    roots = {module.split(".")[0] for module in imports(path)}
-    if layer(path) in WITHOUT_CASADI:
-        assert "casadi" not in roots
+def test_imports_point_towards_the_specification():
+    assert offenders(lambda path: list(upward(path)), LAYERED) == {}
 
 
-@own_files
-def test_optional_and_heavy_packages_are_imported_where_they_are_used(path):
-    top = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Import | ast.ImportFrom)]
+def test_casadi_stays_where_equations_are_made():
+    files = [path for path in LAYERED if layer(path) in WITHOUT_CASADI]
+    assert offenders(lambda path: [m for m in imports(path) if m.split(".")[0] == "casadi"], files) == {}
+
+
+def imported_at_once(path):
+    """Packages that a file imports outside its functions."""
+    top = [node for node in parsed(path).body if isinstance(node, ast.Import | ast.ImportFrom)]
     names = [a.name for node in top if isinstance(node, ast.Import) for a in node.names]
     names += [node.module for node in top if isinstance(node, ast.ImportFrom)]
-    assert not {name.split(".")[0] for name in names} & set(LATE)
+    return {name.split(".")[0] for name in names}
+
+
+def test_optional_and_heavy_packages_are_imported_where_they_are_used():
+    assert offenders(lambda path: imported_at_once(path) & set(LATE)) == {}
 
 
 def loaded(script, names, **environment):
@@ -297,33 +314,34 @@ def functions(path):
             else:
                 yield from inside(child, prefix)
 
-    return inside(ast.parse(path.read_text()), "")
+    return inside(parsed(path), "")
 
 
-@own_files
-def test_a_function_can_be_read_at_once(path):
-    """Its statements without the docstring; what is defined inside counts, too."""
-    sizes = {}
-    for name, node in functions(path):
-        statements = node.body[ast.get_docstring(node) is not None :]
-        sizes[name] = node.end_lineno - statements[0].lineno + 1 if statements else 0
-    assert {name: size for name, size in sizes.items() if size > MOST_IN_A_FUNCTION} == {}
+def size(node):
+    """Lines of a function without its docstring; what is defined inside counts, too."""
+    statements = node.body[ast.get_docstring(node) is not None :]
+    return node.end_lineno - statements[0].lineno + 1 if statements else 0
 
 
-@own_files
-def test_a_function_has_few_parameters(path):
+def test_functions_can_be_read_at_once():
+    assert offenders(lambda path: [name for name, node in functions(path) if size(node) > MOST_IN_A_FUNCTION]) == {}
+
+
+def arguments(node):
+    a = node.args
+    names = [arg.arg for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs, a.vararg, a.kwarg) if arg is not None]
+    return [n for n in names if n not in ("self", "cls")]
+
+
+def test_functions_have_few_parameters():
     """Options that belong together travel as one value."""
-    counts = {}
-    for name, node in functions(path):
-        a = node.args
-        names = [arg.arg for arg in (*a.posonlyargs, *a.args, *a.kwonlyargs, a.vararg, a.kwarg) if arg is not None]
-        counts[name] = len([n for n in names if n not in ("self", "cls")])
-    assert {name: n for name, n in counts.items() if n > MOST_PARAMETERS and name not in SHEETS} == {}
+    many = lambda name, node: len(arguments(node)) > MOST_PARAMETERS and name not in SHEETS  # noqa: E731
+    assert offenders(lambda path: [name for name, node in functions(path) if many(name, node)]) == {}
 
 
 def defined(path):
     """Public names that a module defines: functions, classes, constants."""
-    for node in ast.parse(path.read_text()).body:
+    for node in parsed(path).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
         elif isinstance(node, ast.Assign | ast.AnnAssign):
@@ -345,7 +363,7 @@ def module_name(path):
 
 def names_imported(path):
     """All that a file imports, `from servoctl.control import batch` as servoctl.control and servoctl.control.batch."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -387,11 +405,11 @@ def test_every_room_is_in_the_documents():
         assert rooms - words == set(), page
 
 
-@own_files
-def test_nothing_is_left_open(path):
-    assert not re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", path.read_text())
+def test_nothing_is_left_open():
+    assert offenders(lambda path: re.findall(r"\b(?:TODO|FIXME|XXX|NotImplementedError)\b", path.read_text())) == {}
 
 
 def test_the_linter_finds_nothing():
+    needs("ruff")
     found = subprocess.run([sys.executable, "-m", "ruff", "check", Path(__file__).parent.parent], capture_output=True, text=True)
     assert found.returncode == 0, found.stdout + found.stderr

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import needs
 from refusals import refused
 
 import servoctl as sv
@@ -95,9 +96,11 @@ def test_threads_give_the_same_bits(loops):
 
 
 def test_dask_gives_the_same_bits(loops):
-    from dask.distributed import Client, LocalCluster
-
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
+    dask = needs("dask.distributed")
+    with (
+        dask.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        dask.Client(cluster) as client,
+    ):
         executor = client.get_executor()
         assert same(loops, sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2, executor=executor))
 
@@ -372,8 +375,7 @@ def test_a_run_gives_extrema_final_values_and_its_residual(gallery_model):
 
 
 def test_a_study_is_saved_loaded_and_given_to_xarray(tmp_path):
-    import xarray
-
+    xarray = needs("xarray")
     study = sv.sweep(picky, sv.grid(m=[1, 2, 3, 4]))
     loaded = sv.load_study(study.save(tmp_path / "study"))
     assert same(study, loaded) and loaded.meta == study.meta

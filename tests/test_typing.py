@@ -6,14 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+from conftest import needs
 
 ROOT = Path(__file__).parents[1]
 
 
 def checked(script, folder):
     """Exit code and errors of mypy, with its default settings."""
-    pytest.importorskip("mypy", reason="mypy is in the extra 'test'")
+    needs("mypy")
     (folder / "script.py").write_text(script)
     command = [sys.executable, "-m", "mypy", "--follow-imports=silent", "--cache-dir", str(folder.parent), "script.py"]
     environment = os.environ | {"MYPYPATH": str(ROOT)}

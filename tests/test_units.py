@@ -9,6 +9,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import needs
 from refusals import refused
 
 import servoctl as sv
@@ -197,6 +198,8 @@ def table(request):
 
 
 def test_tables_have_the_same_columns_and_units(table, tmp_path):
+    needs("pandas")
+    needs("xarray")
     frame, data = table.to_pandas(), table.to_xarray()
     study = isinstance(table, sv.Study)
     names = list(table.columns if study else table.names)

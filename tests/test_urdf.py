@@ -1,7 +1,6 @@
 """Robots from URDF files: inertia, forces and frames against pinocchio and closed forms; what is refused."""
 
 from functools import lru_cache
-from importlib.util import find_spec
 
 import casadi as ca
 import numpy as np
@@ -24,10 +23,7 @@ INERTIAL = '<inertial><mass value="2"/><inertia ixx="1" iyy="2" izz="2.5"/></ine
 
 @lru_cache
 def robot(name, base="fixed"):
-    path = robots.file_of(name)
-    if path is None:
-        pytest.skip("example-robot-data is not installed")
-    return sv.urdf(path, base=base)
+    return sv.urdf(robots.file_of(name), base=base)
 
 
 def bar(inertial=INERTIAL, kind="revolute", inside='<axis xyz="0 1 0"/>', more=""):
@@ -37,7 +33,6 @@ def bar(inertial=INERTIAL, kind="revolute", inside='<axis xyz="0 1 0"/>', more="
 # against pinocchio ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(find_spec("pinocchio") is None, reason="pinocchio is not installed")
 @pytest.mark.parametrize("name, base", CASES)
 def test_forces_and_mass_matrix_equal_pinocchio(name, base):
     arm = robot(name, base)
@@ -56,7 +51,6 @@ def test_forces_and_mass_matrix_equal_pinocchio(name, base):
         assert np.abs(mass[np.ix_(rows, rows)] - matrix).max() < 1e-12 * np.abs(matrix).max()
 
 
-@pytest.mark.skipif(find_spec("pinocchio") is None, reason="pinocchio is not installed")
 @pytest.mark.parametrize("name, base", [("six_axis_arm", "fixed"), ("quadruped", "free"), ("talos", "free")])
 def test_frames_and_their_jacobians_equal_pinocchio(name, base):
     arm = robot(name, base)

@@ -9,7 +9,6 @@ import functools
 import io
 import math
 import os
-import signal
 import tempfile
 import warnings
 from collections import Counter
@@ -19,13 +18,14 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 from scipy import stats
+from work import TooMuchWork, at_most
 
 import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.shell.main import main
 
 WORDS = ("accepted", "refused")
-SECONDS, WAITING = 10, 60  # of processor time, and of all time, of a call before it counts as hanging
+MOST_CALLS = 20_000_000  # of functions, within a call before it counts as hanging
 
 ODD = {
     "None": None, "text": "abc", "no text": "", "a number in text": "1.0", "NUL": "a\0b", "a surrogate": "\ud800",
@@ -37,10 +37,6 @@ ODD = {
     "function": lambda *_: 1, "function of nothing": lambda: 1, "object": object(), "type": int,
     "{'x': None}": {"x": None}, "{'x': 1e300}": {"x": 1e300}, "{'zz': 1}": {"zz": 1.0}, "{None: 1}": {None: 1.0},
 }  # fmt: skip
-
-
-class Hanging(BaseException):
-    """Raised by the alarm in a call that does not end."""
 
 
 def point():
@@ -396,28 +392,18 @@ def doubled(a):
 
 def outcome(call, arguments):
     """How a call ends: "accepted", "refused", "hangs", or the error of another package."""
-
-    def late(*_):
-        raise Hanging
-
-    signal.signal(signal.SIGPROF, late)
-    signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)
-    signal.alarm(WAITING)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), at_most(MOST_CALLS):
             warnings.simplefilter("ignore")
             call(**arguments)
     except ServoError:
         return "refused"
-    except Hanging:
+    except TooMuchWork:
         return "hangs"
     except Exception as error:
         where = f" ({type(error).__name__})"
         return f"{str(error).splitlines()[0][:90] if str(error) else 'no text'}{where}"
     finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.alarm(0)
         plt.close("all")
     return "accepted"
 

@@ -1,13 +1,13 @@
 """The verdict on a case: a plan that `verify` passes and the reference confirms, or a refusal that it confirms."""
 
 import re
-import signal
 import warnings
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 from derivative_array import Reference
+from work import TooMuchWork, at_most
 
 import servoctl as sv
 
@@ -22,7 +22,7 @@ BESIDE = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # distances [s, too] from a state at 
 NEARLY = 0.99  # of the way to a stop before the first sample, which is followed again
 POWER = 0.3  # or it grows at least with this power of one over the time that is left
 LARGE = 1e4  # a motion that has grown so far may end
-PATIENCE = 60  # s of processor time for a case; a few tenths are usual
+MOST_CALLS = 100_000_000  # of functions, for a case; half a million are usual
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,6 @@ class Verdict:
     @property
     def wrong(self):
         return self.outcome.startswith("wrong")
-
-
-class _OutOfTime(BaseException):
-    pass
 
 
 def specification(case):
@@ -80,20 +76,12 @@ def specification(case):
 
 def judge(case):
     """Run a case through the package and the reference."""
-    signal.signal(signal.SIGPROF, _out_of_time)
-    signal.setitimer(signal.ITIMER_PROF, PATIENCE)
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
+        with warnings.catch_warnings(), np.errstate(all="ignore"), at_most(MOST_CALLS):
             warnings.simplefilter("ignore")
             return _judge(case)
-    except _OutOfTime:
-        return Verdict(f"wrong: longer than {PATIENCE} s")
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-
-
-def _out_of_time(*_):
-    raise _OutOfTime
+    except TooMuchWork:
+        return Verdict(f"wrong: more than {MOST_CALLS} calls")
 
 
 def _judge(case):
@@ -115,8 +103,8 @@ def _judge(case):
         proof = sv.verify(model, run, segments=1)
     except sv.ServoError as error:
         return _refused(reference, case, stage, error, start, model)
-    except _OutOfTime:
-        return Verdict(f"wrong: longer than {PATIENCE} s in {stage}")
+    except TooMuchWork:
+        return Verdict(f"wrong: more than {MOST_CALLS} calls in {stage}")
     except Exception as error:  # noqa: BLE001
         return Verdict(f"wrong: {type(error).__name__} in {stage}", str(error))
     return _compared(reference, case, model, run, proof)

@@ -2,7 +2,7 @@
 
 Findings are saved as text, one file for each, named by seed; `--case FILE` or `--seed N --cases 1` runs one again.
 `--log FILE` keeps one line for each case as soon as it ends: the same command goes on after an interruption, and with
-`--cases 0` it prints the counts so far. A case has at most `judge.PATIENCE` seconds of processor time.
+`--cases 0` it prints the counts so far. A case makes at most `judge.MOST_CALLS` calls.
 """
 
 import argparse
