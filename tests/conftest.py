@@ -1,9 +1,9 @@
 """Models that are derived once for all tests, numbers from expressions, and the first tier.
 
-`pytest` runs the first tier, `pytest --all` every test; a file or a test that is named is run whole. The first tier is
-the first case of each function that `tests/left.txt` does not list. A line of that list is a test function, or a file
-that is not even imported; `tests/tiers.py` measures and writes it, so that a new test is in the first tier until it is
-found to be slow.
+`pytest` runs the first tier, `pytest --all` every test; a file or a test that is named is run whole. The first tier has
+the first case of each function that `tests/left.txt` does not list; a line there is a function, or a file that is not
+even imported. The third tier has the other cases of the functions in `tests/by_hand.txt`, the second has the rest.
+`tests/tiers.py` measures and writes both lists, so that a new test is in the first tier until it is found to be slow.
 """
 
 import os
@@ -167,56 +167,67 @@ def signal(model, kind, t, jets):
 # tiers ---------------------------------------------------------------------------------------------------------------
 
 TESTS = Path(__file__).parent
-LEFT = TESTS.joinpath("left.txt").read_text(encoding="utf-8").split()
-FURTHER = pytest.StashKey()  # how many cases the first tier leaves of its functions; None where everything is run
+LEFT = set(TESTS.joinpath("left.txt").read_text(encoding="utf-8").split())
+BY_HAND = {line.split()[1] for line in TESTS.joinpath("by_hand.txt").read_text(encoding="utf-8").splitlines()}
+TIER, FURTHER = pytest.StashKey(), pytest.StashKey()  # the tier that is run; cases that the first one leaves
 
 
 def pytest_addoption(parser):
-    """`--all`."""
-    parser.addoption("--all", action="store_true", help="every test, where no file or test is given (CONTRIBUTING.md)")
+    """The tiers; without one of these the first is run."""
+    group = parser.getgroup("tiers", "Tiers, where no file or test is named (CONTRIBUTING.md)")
+    group.addoption("--all", dest="tier", action="store_const", const="all", default="first", help="every test")
+    group.addoption("--second", dest="tier", action="store_const", const="second", help="what a change must pass, too")
+    group.addoption("--third", dest="tier", action="store_const", const="third", help="what is run by hand")
 
 
 def pytest_configure(config):
-    """The first tier is what runs where neither `--all` nor a file or test is given."""
+    """What is named is run whole."""
     given = [config.invocation_params.dir / argument for argument in config.args]
-    config.stash[FURTHER] = 0 if given == [TESTS] and not config.option.all else None
+    config.stash[TIER] = config.option.tier if given == [TESTS] else "all"
 
 
 def pytest_ignore_collect(collection_path, config):
     """Files that the first tier leaves are not imported."""
-    if config.stash[FURTHER] is not None and collection_path.relative_to(TESTS).as_posix() in LEFT:
+    if config.stash[TIER] == "first" and collection_path.relative_to(TESTS).as_posix() in LEFT:
         return True
 
 
+def tier_of(name, is_first):
+    """The tier of a case of a test function, which may be its first one."""
+    if is_first and not LEFT & {name, name.partition("::")[0]}:
+        return "first"
+    return "third" if name in BY_HAND else "second"
+
+
 def pytest_collection_modifyitems(config, items):
-    """Take the first tier; tests with "RadauIIA" among their parameters use the compiler, as its steps are C code."""
-    if config.stash[FURTHER] is not None:
-        left = {f"tests/{name}" for name in LEFT}
-        first = {item.nodeid.partition("[")[0]: item for item in reversed(items)}
-        kept = [item for name, item in reversed(first.items()) if name not in left]
-        config.stash[FURTHER] = len(items) - len(first)
-        items[:] = kept
+    """Take a tier; tests with "RadauIIA" among their parameters use the compiler, as its steps are C code."""
+    tier, names, taken = config.stash[TIER], set(), []
     for item in items:
+        name = item.nodeid.partition("[")[0].removeprefix("tests/")
+        if tier in ("all", tier_of(name, name not in names)):
+            taken.append(item)
+        names.add(name)
         if "RadauIIA" in item.name and hasattr(item, "fixturenames"):
             item.fixturenames.append("c_compiler")
+    config.stash[FURTHER] = len(items) - len(taken)
+    items[:] = taken
 
 
 def pytest_sessionfinish(session):
     """A worker of xdist tells what it left."""
     if hasattr(session.config, "workeroutput"):
-        session.config.workeroutput["further"] = session.config.stash[FURTHER]
+        session.config.workeroutput["further"] = session.config.stash.get(FURTHER, 0)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node):
     """What a worker of xdist told; they all collect the same."""
-    node.config.stash[FURTHER] = getattr(node, "workeroutput", {}).get("further")
+    node.config.stash[FURTHER] = getattr(node, "workeroutput", {}).get("further", 0)
 
 
 def pytest_terminal_summary(terminalreporter, config):
     """Say what the first tier left."""
-    further = config.stash[FURTHER]
-    if further is not None:
+    if config.stash[TIER] == "first":
         files = sum("::" not in name for name in LEFT)
-        left = f"{len(LEFT) - files} slow functions, {files} files and {further} further cases"
-        terminalreporter.write_line(f"The first tier of the tests; left to pytest --all: {left} of its functions.")
+        left = f"{config.stash.get(FURTHER, 0)} cases that are slow or further ones of their functions, and {files} files"
+        terminalreporter.write_line(f"This is the first tier of the tests; left to pytest --all: {left}.")

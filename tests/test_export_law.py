@@ -200,7 +200,7 @@ def test_an_arm_follows_its_path_under_a_controller_in_floats(tmp_path):
 
 def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):
     if which("g++") is None:
-        pytest.skip("there is no g++")
+        pytest.skip("needs g++")
     source, header = sv.export_c(sv.lqr(plan, sv.plant(CRANE)), tmp_path, name="loop", thinned=1e-4)
     (tmp_path / "main.cpp").write_text(
         '#include "loop.h"\nint main() { double y[LOOP_NY] = {}, z[1], u[LOOP_NU]; loop_start(z); return loop_step(0, y, z, u); }\n'
@@ -254,7 +254,7 @@ int main()
 
 def test_the_controller_of_the_documents_gives_the_commands_of_the_law(plan, tmp_path):
     if which("g++") is None:
-        pytest.skip("there is no g++")
+        pytest.skip("needs g++")
     page = (Path(__file__).parents[1] / "docs" / "c_export.md").read_text()
     (shown,) = re.findall(r"```cpp\n(.*?)```", page, re.S)
     source, _ = sv.export_c(sv.lqr(plan, sv.plant(CRANE), integral=True), tmp_path, name="loop", thinned=1e-4)
@@ -305,7 +305,7 @@ WITHIN_LIMITS = {  # and the size of its random measurements; bounds may exclude
 def test_a_law_in_c_runs_without_a_complaint_of(kind, real, tool, plan, tmp_path):
     """Random measurements, every 50th of them infinite or no number, before the plan, along it and after its end."""
     if tool == "valgrind" and which("valgrind") is None:
-        pytest.skip("there is no valgrind")
+        pytest.skip("needs valgrind")
     limited, size = WITHIN_LIMITS[kind]
     law = limited(sv.lqr(plan, sv.plant(CRANE), integral=True))
     source, _ = sv.export_c(law, tmp_path, name="loop", real=real, thinned=1e-4)
@@ -319,7 +319,7 @@ def test_a_law_in_c_runs_without_a_complaint_of(kind, real, tool, plan, tmp_path
     built = subprocess.run(["gcc", "-std=c99", *flags, str(tmp_path / "main.c"), str(source), "-o", str(run), "-lm"],
                            capture_output=True, text=True)  # fmt: skip
     if built.returncode and tool == "sanitizers":
-        pytest.skip(f"the compiler has no sanitizers: {built.stderr[:100]}")
+        pytest.skip(f"needs a compiler with sanitizers: {built.stderr[:100]}")
     before = ["valgrind", "-q", "--error-exitcode=9"] if tool == "valgrind" else []
     done = subprocess.run([*before, str(run)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -5,12 +5,14 @@
     python tests/tiers.py write     the lists: tests/left.txt, tests/by_hand.txt
 
 Measurements are added to a folder, by default `tiers` in the system's folder for temporary files. A test that was
-skipped in any of them, such as for an extra that is not installed, is in no first tier. The first tier has all
-functions that are fast, and of the others those that execute most new arcs per second.
+skipped in any of them, such as for an extra that is not installed, is in no first tier. The first two tiers
+have what executes most new arcs of the package per second, until their time is spent; a case counts as an arc.
 """
 
 import argparse
+import heapq
 import json
+import math
 import os
 import subprocess
 import sys
@@ -19,10 +21,8 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent
 FOLDER = Path(os.environ.get("SERVOCTL_TIERS", Path(tempfile.gettempdir(), "tiers")))
-FAST = 0.3  # CPU s: a first case up to this is in the first tier
-FIRST = 300.0  # CPU s of the first tier, collecting left out
-CHECKED = 2400.0  # CPU s of what the checks of a change run of the rest
-UNTIMED = 0.02  # CPU s that each test costs at least: reports, fixtures
+FIRST, SECOND = 300.0, 2200.0  # CPU s of the first two tiers, collecting left out
+LEAST = 0.02  # CPU s that a case costs at least, in reports and fixtures
 
 
 # the plugin of pytest that measures --------------------------------------------------------------------------------
@@ -94,15 +94,17 @@ def measure(kind):
 
 
 def measured():
-    """CPU seconds of all cases by their ids, and the names of skipped functions."""
-    seconds, skipped = {}, set()
+    """CPU seconds of each case by its id, ids of first cases by function, and functions that were skipped somewhere."""
+    seconds, firsts, skipped = {}, {}, set()
     for file in FOLDER.glob("*.jsonl"):
         for line in map(json.loads, file.read_text(encoding="utf-8").splitlines()):
             if "times" in line:
-                seconds[line["test"]] = line["times"]
-            if "skipped" in line:
+                seconds[line["test"]] = max(line["times"], LEAST)
+            elif "arcs" in line:
+                firsts[function(line["test"])] = line["test"]
+            else:
                 skipped.add(function(line["test"]))
-    return seconds, skipped
+    return seconds, firsts, skipped
 
 
 def executed():
@@ -120,31 +122,48 @@ def executed():
     return arcs
 
 
-def chosen(costs, arcs, budget, seen=()):
-    """Names in the order of their new arcs per second, as long as the budget lasts."""
-    seen, left, taken = set(seen), dict(costs), []
-    while left:
-        name = max(left, key=lambda one: len(arcs.get(one, set()) - seen) / left[one])
-        if budget < left[name]:
-            del left[name]  # a cheaper one may still fit
-            continue
-        budget -= left.pop(name)
-        seen |= arcs.get(name, set())
-        taken.append(name)
-    return taken
+def chosen(costs, gains, seen, budget):
+    """Names with the most new arcs per second, where a case counts as an arc, until the budget is spent.
+
+    What a name gains only falls as others are taken, so that the heap holds bounds of it.
+    """
+    heap, taken = [(-math.inf, name) for name in costs], []
+    heapq.heapify(heap)
+    while heap:
+        _, name = heapq.heappop(heap)
+        cases, arcs = gains[name]
+        gain = -(cases + len(arcs - seen)) / costs[name]
+        if heap and gain > heap[0][0]:
+            heapq.heappush(heap, (gain, name))
+        elif costs[name] <= budget:
+            budget -= costs[name]
+            seen |= arcs
+            taken.append(name)
+    return set(taken)
 
 
 def write():
-    """Write both lists, and say what they hold."""
-    seconds, skipped = measured()
-    arcs, firsts, rests = executed(), {}, {}
-    for case, cost in seconds.items():  # the first case of a function stands first
-        name = function(case)
-        if name in firsts:
-            rests[name] = rests.get(name, 0.0) + max(cost, UNTIMED)
-        else:
-            firsts[name] = max(cost, UNTIMED)
-    print(firsts and arcs and rests and skipped and len(firsts))
+    """Write both lists, and say what they leave."""
+    seconds, firsts, skipped = measured()
+    arcs, reached, cases = executed(), set(), {}
+    for case in seconds:
+        cases.setdefault(function(case), []).append(case)
+    nothing = set()
+    costs = {name: seconds[firsts[name]] for name in cases if name not in skipped}
+    first = chosen(costs, {name: (1, arcs.get(name, nothing)) for name in costs}, reached, FIRST)
+    share = len(reached) / len(set().union(*arcs.values()))
+    print(f"first tier: {len(first)} functions, {sum(map(costs.get, first)):.0f} s, {share:.1%} of the arcs of all first cases")
+    rest = {name: [case for case in ids if name not in first or case != firsts[name]] for name, ids in cases.items()}
+    costs = {name: sum(map(seconds.get, ids)) for name, ids in rest.items() if ids}
+    gains = {name: (len(rest[name]), nothing if name in first else arcs.get(name, nothing)) for name in costs}
+    second = chosen(costs, gains, reached, SECOND)
+    third = sorted(((costs[name], name) for name in costs if name not in second), reverse=True)
+    print(f"second tier: {sum(map(costs.get, second)):.0f} s; third: {len(third)} functions, {sum(c for c, _ in third):.0f} s")
+    files = {name.partition("::")[0] for name in cases} - {name.partition("::")[0] for name in first}
+    left = files | {name for name in cases if name not in first and name.partition("::")[0] not in files}
+    TESTS.joinpath("left.txt").write_text("".join(f"{name}\n" for name in sorted(left)), encoding="utf-8")
+    by_hand = "".join(f"{cost:.0f} {name}\n" for cost, name in third)
+    TESTS.joinpath("by_hand.txt").write_text(by_hand, encoding="utf-8")
 
 
 def main():
