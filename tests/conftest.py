@@ -201,15 +201,15 @@ def tier_of(name, is_first):
 
 def pytest_collection_modifyitems(config, items):
     """Take a tier; tests with "RadauIIA" among their parameters use the compiler, as its steps are C code."""
-    tier, names, taken = config.stash[TIER], set(), []
+    tier, names, taken, left = config.stash[TIER], set(), [], []
     for item in items:
         name = item.nodeid.partition("[")[0].removeprefix("tests/")
-        if tier in ("all", tier_of(name, name not in names)):
-            taken.append(item)
+        (taken if tier in ("all", tier_of(name, name not in names)) else left).append(item)
         names.add(name)
         if "RadauIIA" in item.name and hasattr(item, "fixturenames"):
             item.fixturenames.append("c_compiler")
-    config.stash[FURTHER] = len(items) - len(taken)
+    config.stash[FURTHER] = len(left)
+    config.hook.pytest_deselected(items=left)
     items[:] = taken
 
 
