@@ -7,6 +7,10 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
+
+if os.environ.get("SERVOCTL_TESTS_LONGDOUBLE") == "double":  # of this size on Windows and on ARM under macOS
+    np.longdouble = np.float64
+
 from scenes import CRANE, CRANE_PROGRAM, POINT, POINT_PROGRAM
 
 import servoctl as sv
@@ -15,7 +19,8 @@ from servoctl.gallery import gallery
 from servoctl.model.model import derive
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
-with warnings.catch_warnings(action="ignore"):  # of a CC that names no program
+with warnings.catch_warnings():  # of a CC that names no program
+    warnings.simplefilter("ignore")
     compiler._warned = compiler.compiler() is None  # without one the whole suite runs in CasADi
 
 

@@ -32,9 +32,9 @@ def find_scene(given):
         return path.stem, _from_file(path)
     error = unknown(given, gallery, "scene")
     if os.path.isfile(f"{given}.py"):
-        error.add_note(f"There is a file {given}.py: give the name with its suffix.")
+        _add_note(error, f"There is a file {given}.py: give the name with its suffix.")
     elif os.path.exists(given):
-        error.add_note(f"{given} exists, but a scene's file ends in .py.")
+        _add_note(error, f"{given} exists, but a scene's file ends in .py.")
     raise error
 
 
@@ -110,7 +110,7 @@ def _reported(path, action):
         return action()
     except ServoError as error:
         line, text = _place(error, path)
-        error.add_note(f"Raised in {path}, line {line}: {text}")
+        _add_note(error, f"Raised in {path}, line {line}: {text}")
         raise
     except (Exception, SystemExit) as error:
         line, text = _place(error, path)
@@ -122,6 +122,11 @@ def _reported(path, action):
             line=line,
             exception=last,
         ) from error
+
+
+def _add_note(error, note):
+    """As `error.add_note(note)`, which Python 3.10 does not have."""
+    error.__notes__ = [*getattr(error, "__notes__", ()), note]
 
 
 def _place(error, path):

@@ -63,10 +63,8 @@ def unpacked(content, q, parameters, shared=None):
         As in `packed`, perhaps of another process.
     """
     function, rest = content
-    unpickler = pickle.Unpickler(io.BytesIO(rest))
     known = dict(enumerate(q.from_function(function, parameters.symbols))) | {"q": q, **(shared or {})}
-    unpickler.persistent_load = known.__getitem__
-    return unpickler.load()
+    return _Unpickler(io.BytesIO(rest), known).load()
 
 
 class _Pickler(pickle.Pickler):
@@ -88,6 +86,17 @@ class _Pickler(pickle.Pickler):
         if not is_dataclass(value) or isinstance(value, type):
             return NotImplemented
         return _made, (type(value), {f.name: getattr(value, f.name) for f in fields(value) if f.init and f.compare})
+
+
+class _Unpickler(pickle.Unpickler):
+    """Returns what a `_Pickler` referred to."""
+
+    def __init__(self, stream, known):
+        super().__init__(stream)
+        self.known = known
+
+    def persistent_load(self, name):
+        return self.known[name]
 
 
 def _made(kind, values):

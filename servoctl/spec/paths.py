@@ -321,9 +321,11 @@ def _by_coefficients(t, times, points, degree, vanishing):
 
     A c = points, where A has a band: operations are in proportion to the number of points, not to its square.
     """
+    from scipy.sparse import csc_matrix  # which CasADi takes, unlike the arrays of SciPy
+
     factors, shapes = _basis(times, degree, vanishing)
     right = ca.vertcat(points, ca.SX(factors.shape[0] - len(times), points.shape[1]))
-    lower, upper = (ca.SX(ca.DM(part.sorted_indices())) for part in (factors.L, factors.U))
+    lower, upper = (ca.SX(ca.DM(csc_matrix(part).sorted_indices())) for part in (factors.L, factors.U))
     c = ca.solve(upper, ca.solve(lower, right[np.argsort(factors.perm_r).tolist(), :]))[factors.perm_c.tolist(), :]
     inside, pieces = _inside(t, times).T, len(times) - 1
     local = [ca.mtimes(inside, c[r : r + pieces, :]) for r in range(degree + 1)]
