@@ -16,8 +16,8 @@ from servoctl.reduction.rows import dependence
 from servoctl.tolerances import EXTENDED
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "numbers.md").read_text()
-TESTS = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+PAGE = (ROOT / "docs" / "numbers.md").read_text(encoding="utf-8")
+TESTS = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
 
 
 def table():
@@ -49,7 +49,7 @@ def test_the_page_has_the_value_in_the_code(module, name, value, test):
 
 @pytest.mark.parametrize("module", MODULES)
 def test_every_number_of_a_module_is_on_the_page(module):
-    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text())
+    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8"))
     constants = importlib.import_module(module)
     names = [
         name.id

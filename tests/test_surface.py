@@ -42,7 +42,7 @@ def layer(path):
 
 def imports(path):
     """Modules that a file imports anywhere, `from servoctl import spec` as servoctl.spec."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -71,7 +71,7 @@ def test_public_names_exist_once_and_in_order():
 def test_type_checkers_see_the_public_names():
     """The stub, executed, binds the objects that the package gives on use, and no others."""
     seen = {}
-    exec(PACKAGE.joinpath("__init__.pyi").read_text(), seen)
+    exec(PACKAGE.joinpath("__init__.pyi").read_text(encoding="utf-8"), seen)
     public = {name: thing for name, thing in seen.items() if name not in ("__builtins__", "__doc__")}
     assert set(public) == {*sv.__all__, "__version__"}
     assert [name for name, thing in public.items() if getattr(sv, name) is not thing] == []
@@ -226,7 +226,7 @@ def test_casadi_stays_where_equations_are_made(path):
 
 @own_files
 def test_optional_and_heavy_packages_are_imported_where_they_are_used(path):
-    top = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.Import | ast.ImportFrom)]
+    top = [node for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.Import | ast.ImportFrom)]
     names = [a.name for node in top if isinstance(node, ast.Import) for a in node.names]
     names += [node.module for node in top if isinstance(node, ast.ImportFrom)]
     assert not {name.split(".")[0] for name in names} & set(LATE)
@@ -297,7 +297,7 @@ def functions(path):
             else:
                 yield from inside(child, prefix)
 
-    return inside(ast.parse(path.read_text()), "")
+    return inside(ast.parse(path.read_text(encoding="utf-8")), "")
 
 
 @own_files
@@ -323,7 +323,7 @@ def test_a_function_has_few_parameters(path):
 
 def defined(path):
     """Public names that a module defines: functions, classes, constants."""
-    for node in ast.parse(path.read_text()).body:
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
         elif isinstance(node, ast.Assign | ast.AnnAssign):
@@ -345,7 +345,7 @@ def module_name(path):
 
 def names_imported(path):
     """All that a file imports, `from servoctl.control import batch` as servoctl.control and servoctl.control.batch."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -382,14 +382,14 @@ def test_every_room_is_in_the_documents():
     rooms = {layer(path) for path in FILES if relative(path) not in ENTRIES}
     root = PACKAGE.parent
     for page, opening in (("CONTRIBUTING.md", "## Layout"), ("docs/architecture.md", "| room |")):
-        text = (root / page).read_text()
+        text = (root / page).read_text(encoding="utf-8")
         words = set(re.findall(r"\w+", text[text.index(opening) :].split("\n## ")[0]))
         assert rooms - words == set(), page
 
 
 @own_files
 def test_nothing_is_left_open(path):
-    assert not re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", path.read_text())
+    assert not re.search(r"\b(TODO|FIXME|XXX|NotImplementedError)\b", path.read_text(encoding="utf-8"))
 
 
 def test_the_linter_finds_nothing():
