@@ -32,9 +32,9 @@ def find_scene(given):
         return path.stem, _from_file(path)
     error = unknown(given, gallery, "scene")
     if os.path.isfile(f"{given}.py"):
-        _add_note(error, f"There is a file {given}.py: give the name with its suffix.")
+        error.__notes__ = [f"There is a file {given}.py: give the name with its suffix."]
     elif os.path.exists(given):
-        _add_note(error, f"{given} exists, but a scene's file ends in .py.")
+        error.__notes__ = [f"{given} exists, but a scene's file ends in .py."]
     raise error
 
 
@@ -110,7 +110,7 @@ def _reported(path, action):
         return action()
     except ServoError as error:
         line, text = _place(error, path)
-        _add_note(error, f"Raised in {path}, line {line}: {text}")
+        error.__notes__ = [*getattr(error, "__notes__", ()), f"Raised in {path}, line {line}: {text}"]
         raise
     except (Exception, SystemExit) as error:
         line, text = _place(error, path)
@@ -122,11 +122,6 @@ def _reported(path, action):
             line=line,
             exception=last,
         ) from error
-
-
-def _add_note(error, note):
-    """As `error.add_note(note)`, which Python 3.10 does not have."""
-    error.__notes__ = [*getattr(error, "__notes__", ()), note]
 
 
 def _place(error, path):

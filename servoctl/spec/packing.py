@@ -63,8 +63,9 @@ def unpacked(content, q, parameters, shared=None):
         As in `packed`, perhaps of another process.
     """
     function, rest = content
-    known = dict(enumerate(q.from_function(function, parameters.symbols))) | {"q": q, **(shared or {})}
-    return _Unpickler(io.BytesIO(rest), known).load()
+    unpickler = _Unpickler(io.BytesIO(rest))
+    unpickler.known = dict(enumerate(q.from_function(function, parameters.symbols))) | {"q": q, **(shared or {})}
+    return unpickler.load()
 
 
 class _Pickler(pickle.Pickler):
@@ -89,11 +90,7 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Returns what a `_Pickler` referred to."""
-
-    def __init__(self, stream, known):
-        super().__init__(stream)
-        self.known = known
+    """Finds in `known` what a `_Pickler` referred to."""
 
     def persistent_load(self, name):
         return self.known[name]
