@@ -157,7 +157,7 @@ def test_poles_of_the_mass_on_a_car():
     assert np.abs(found - np.sort_complex(np.append(expected, [0, 0]))).max() < 1e-6
     assert (car.input_labels, car.output_labels) == (["force", "disturbance s"], ["x", "s", "dx", "ds"])
     assert car.state_labels == ["x", "s", "dx", "ds"] and car.name == "plant"
-    step = control.step_response(car["dx", "force"], np.linspace(0, 60.0, 2001))
+    step = control.step_response(car[2, 0], np.linspace(0, 60.0, 2001))
     slope = np.polyfit(step.time[-500:], step.outputs[-500:], 1)[0]
     assert step.output_labels == ["dx"] and slope == pytest.approx(1 / (m_1 + m_2), rel=1e-4)  # F/(m_1 + m_2)
 
