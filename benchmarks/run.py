@@ -88,16 +88,17 @@ def main():
         parser.error(f"no row {', '.join(unknown)}; there are {', '.join(ROWS)}")
     if arguments.rounds < 5:
         parser.error("a median needs at least 5 rounds")
-    kept = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    kept = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     measured, about = {}, {"machine": harness.machine(), "date": datetime.now(UTC).date().isoformat()}
     for key in arguments.rows or ROWS:
         measured[key] = harness.measure(ROWS[key](), arguments.rounds) | about
         print(table({key: measured[key]}), flush=True)
         kept = {name: measured.get(name) or kept.get(name) for name in ROWS if name in measured or name in kept}
-        RESULTS.write_text(json.dumps(kept, indent=1) + "\n")
+        RESULTS.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
     if arguments.update:
-        before, rest = README.read_text().split(BEGIN)
-        README.write_text(before + BEGIN + "\n" + machines(kept) + "\n" + table(kept) + END + rest.split(END)[1])
+        before, rest = README.read_text(encoding="utf-8").split(BEGIN)
+        text = before + BEGIN + "\n" + machines(kept) + "\n" + table(kept) + END + rest.split(END)[1]
+        README.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def outside(app, docname, source):
 def as_page(notebook, folder):
     """The cells of a notebook with their stored outputs as a page; pictures are written to a folder."""
     parts = []
-    for cell in json.loads(notebook.read_text())["cells"]:
+    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
         text = "".join(cell["source"])
         parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
         for output in cell.get("outputs", ()):
@@ -67,7 +67,7 @@ def notebooks(app):
     rmtree(folder, ignore_errors=True)
     folder.mkdir()
     for notebook in sorted((HERE.parent / "notebooks").glob("*.ipynb")):
-        (folder / f"{notebook.stem}.md").write_text(as_page(notebook, folder))
+        (folder / f"{notebook.stem}.md").write_text(as_page(notebook, folder), encoding="utf-8")
 
 
 def setup(app):

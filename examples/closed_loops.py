@@ -106,7 +106,8 @@ def angle_error(run):
 
 def pendubot_upright():
     """Held where it falls over: LQR from 0.1 rad off; 10 % more mass, double friction [rad]. Computed is refused."""
-    with warnings.catch_warnings(action="ignore"):  # of unstable internal dynamics: the law is there for these
+    with warnings.catch_warnings():  # of unstable internal dynamics: the law is there for these
+        warnings.simplefilter("ignore")
         plan, nominal = planned("pendubot", build=partial(pendubot, start=90.0, end=90.0))
     internal = sv.internal_dynamics(plan.model, plan)
     print(internal)

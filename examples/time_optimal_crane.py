@@ -3,6 +3,7 @@
 import sys
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 import servoctl as sv
 from servoctl.gallery import overhead_crane
@@ -17,7 +18,7 @@ def active(plan, near=0.01):
     for name, (low, high) in LIMITS.items():
         margin = near * max(abs(low), abs(high))
         on |= (plan[name] < low + margin) | (plan[name] > high - margin)
-    return float(np.trapezoid(on.astype(float), plan.t) / np.ptp(plan.t))
+    return float(trapezoid(on.astype(float), plan.t) / np.ptp(plan.t))
 
 
 def save_figure(plans, path):

@@ -54,7 +54,7 @@ def column(value, what, size=None):
 
 def _not_truth(value):
     """The value; TypeError for True and False, which CasADi takes for numbers."""
-    if isinstance(value, (bool, np.bool)):
+    if isinstance(value, (bool, np.bool_)):
         raise TypeError("a truth value is no number")
     return value
 
@@ -156,7 +156,7 @@ def as_path(value, what="The path"):
 def as_numbers(value):
     """An array of float from a number or an array-like of numbers; NaN from anything else, text among it."""
     try:
-        truths = isinstance(value, (list, tuple)) and any(isinstance(x, (bool, np.bool)) for x in value)
+        truths = isinstance(value, (list, tuple)) and any(isinstance(x, (bool, np.bool_)) for x in value)
         array = np.asarray(value, dtype=object if truths else None)
         if array.dtype.kind == "O":
             array = np.array([x if is_number(x) else math.nan for x in array.ravel()]).reshape(array.shape)
@@ -219,7 +219,7 @@ def plain(value):
 def finite(name, value, what="value"):
     """A finite float from a number; `what` it is, in the singular: "limit", "noise"."""
     try:
-        number = math.nan if isinstance(value, (str, bytes, complex, bool, np.bool)) else float(value)
+        number = math.nan if isinstance(value, (str, bytes, complex, bool, np.bool_)) else float(value)
     except Exception:  # CasADi raises its own types for symbols
         number = math.nan
     if not math.isfinite(number):

@@ -2,9 +2,16 @@
 
 from dataclasses import MISSING, FrozenInstanceError, dataclass, field, fields
 from functools import partial, wraps
-from typing import dataclass_transform
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from typing_extensions import dataclass_transform  # since Python 3.11 in typing, too
+else:
+
+    def dataclass_transform(**_):  # noqa: D103 - type checkers read the other one
+        return lambda decorator: decorator
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))

@@ -16,6 +16,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when casadi is imported; m
 import casadi as ca
 import numpy as np
 import pytest
+
+if os.environ.get("SERVOCTL_TESTS_LONGDOUBLE") == "double":  # of this size on Windows and on ARM under macOS
+    np.longdouble = np.float64
+
 from scenes import CRANE, CRANE_PROGRAM, POINT, POINT_PROGRAM
 
 import servoctl as sv
@@ -24,7 +28,8 @@ from servoctl.gallery import gallery
 from servoctl.model.model import derive
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
-with warnings.catch_warnings(action="ignore"):  # of a CC that names no program
+with warnings.catch_warnings():  # of a CC that names no program
+    warnings.simplefilter("ignore")
     compiler._warned = compiler.compiler() is None  # without one the whole suite runs in CasADi
 
 

@@ -301,13 +301,13 @@ def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):
     with refused(ServoError, "ffmpeg"):
         shown.save(tmp_path / "crane.mp4")
     program = tmp_path / "ffmpeg"
-    program.write_text('#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\necho "$@" > "$last.txt"\n')
+    program.write_text('#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\necho "$@" > "$last.txt"\n', encoding="utf-8")
     program.chmod(program.stat().st_mode | stat.S_IEXEC)
     raw = shown.save(tmp_path / "crane.mp4").read_bytes()
-    words = (tmp_path / "crane.mp4.txt").read_text().split()
+    words = (tmp_path / "crane.mp4.txt").read_text(encoding="utf-8").split()
     width, height = map(int, words[words.index("-s") + 1].split("x"))
     assert width % 2 == height % 2 == 0 and len(raw) == 3 * width * height * 3 and words[words.index("-r") + 1] == "2"
-    program.write_text("#!/bin/sh\necho broken codec >&2\nexit 1\n")
+    program.write_text("#!/bin/sh\necho broken codec >&2\nexit 1\n", encoding="utf-8")
     with refused(ServoError, "broken codec"):
         shown.save(tmp_path / "crane.mp4")
 

@@ -155,7 +155,7 @@ def test_a_damaged_library_is_built_again(fresh, monkeypatch, damage):
 
 
 def test_an_unusable_cache_is_replaced_by_a_temporary_directory(fresh, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", encoding="utf-8")
     monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path / "file" / "cache"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -207,7 +207,7 @@ def test_without_a_compiler_one_warning_and_the_same_results(fresh, monkeypatch,
 def test_a_compiler_that_refuses_flags_still_compiles(fresh, tmp_path, monkeypatch, refused, kept):
     """As clang, which knows no -fno-tree-pre."""
     script = tmp_path / "plain-cc"
-    script.write_text(f'#!/bin/sh\ncase "$*" in *{refused}*) exit 1;; esac\nexec cc "$@"\n')
+    script.write_text(f'#!/bin/sh\ncase "$*" in *{refused}*) exit 1;; esac\nexec cc "$@"\n', encoding="utf-8")
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
     assert compiler.library("int seven(void) { return 7; }", functions.ALONG_A_PATH).seven() == 7
@@ -221,7 +221,7 @@ def test_a_compiler_that_refuses_flags_still_compiles(fresh, tmp_path, monkeypat
 )
 def test_a_compiler_that_does_not_serve_is_warned_about(fresh, tmp_path, monkeypatch, script, patience):
     command = tmp_path / "odd-cc"
-    command.write_text(f"#!/bin/sh\n{script}\n")
+    command.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
     command.chmod(0o755)
     monkeypatch.setenv("SERVOCTL_COMPILER", str(command))
     monkeypatch.setattr(compiler, "PATIENCE_WITH_COMPILER", patience)
@@ -246,7 +246,7 @@ def test_a_named_compiler_that_does_not_exist_is_warned_about(fresh, monkeypatch
 def test_a_cache_without_room_is_replaced_by_a_temporary_directory(fresh, tmp_path, monkeypatch):
     script = tmp_path / "full-cc"
     script.write_text(f'#!/bin/sh\ncase "$*" in *{tmp_path}/cache*) echo "No space left on device" >&2; exit 1;; esac\n'
-                      'exec cc "$@"\n')
+                      'exec cc "$@"\n', encoding="utf-8")
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
     model = pendulum(("rk",))
@@ -307,7 +307,7 @@ def test_the_command_says_what_the_cache_holds_and_clears_it(fresh, tmp_path, ca
     monkeypatch.delenv("SERVOCTL_MEMO", raising=False)
     model = sv.derive(*gallery["overhead-crane"].build())
     sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 1.0))
-    (tmp_path / "cache" / "notes.txt").write_text("not of the cache")
+    (tmp_path / "cache" / "notes.txt").write_text("not of the cache", encoding="utf-8")
     held = said()
     assert held["libraries"] == len(library_files(tmp_path)) > 0
     assert said("--clear") == {"libraries": 0, "derivations": 0, "temporary": 0}

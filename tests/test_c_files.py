@@ -40,7 +40,7 @@ def test_a_file_that_changed_makes_other_libraries(tmp_path, monkeypatch):
     digest = loops.digest.__wrapped__
     assert digest() == before
     for name in ("closed.c", "sampled.h"):
-        (tmp_path / name).write_text((tmp_path / name).read_text() + "\n")
+        (tmp_path / name).write_text((tmp_path / name).read_text(encoding="utf-8") + "\n", encoding="utf-8")
         assert digest() != before
         before = digest()
 

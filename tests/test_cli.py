@@ -47,7 +47,7 @@ pytestmark = pytest.mark.usefixtures("here")
 
 @pytest.fixture
 def fall(here):
-    (here / "fall.py").write_text(FALL)
+    (here / "fall.py").write_text(FALL, encoding="utf-8")
     return "fall.py"
 
 
@@ -170,7 +170,7 @@ def test_a_program_that_cannot_be_realised_is_reported(here, capsys):
         "    q = sv.coordinates('x y')\n"
         "    x, y = q\n"
         "    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={'F': x})\n"
-        "    return mechanism, sv.Program({'x': x - q.t, 'y': y})\n"
+        "    return mechanism, sv.Program({'x': x - q.t, 'y': y})\n", encoding="utf-8"
     )
     assert main(["report", "free.py"]) == 0
     assert "Report: not realisable" in capsys.readouterr().out
@@ -202,7 +202,7 @@ def test_the_page_shows_the_motion(here, fall):
 
 def test_a_mechanism_that_cannot_be_drawn_has_a_page_without_it(here, capsys):
     text = FALL.replace("x y", "a b").replace('"y"', '"b"')
-    (here / "turn.py").write_text(text.replace('"dy"', '"db"').replace('"x": "m", "b": "m"', '"a": "rad"'))
+    (here / "turn.py").write_text(text.replace('"dy"', '"db"').replace('"x": "m", "b": "m"', '"a": "rad"'), encoding="utf-8")
     assert main(["run", "turn.py", "--animate", "--no-verify", "--no-loop"]) == 0
     assert "There is no animation" in capsys.readouterr().err
     names = {f.name for f in (here / "servoctl-runs" / "turn").iterdir()}
@@ -227,7 +227,7 @@ def test_a_start_may_hold_outputs(here):
     """In START and in --hold, as model.start does: the distance of the mass from (0, -1), and its speed."""
     outputs = 'outputs={"distance": (x**2 + (y + 1) ** 2) ** 0.5, "speed": q.dt(y)}, parameters=p)'
     text = FALL.replace("parameters=p)", outputs).replace('START = {"y": 0.0, "dy": 0.0}', 'START = {"distance": 3.0}')
-    (here / "far.py").write_text(text + '\nGUESS = {"y": 1.0}\n')
+    (here / "far.py").write_text(text + '\nGUESS = {"y": 1.0}\n', encoding="utf-8")
     for command in ("run far.py --no-verify --no-figures --no-loop", "sweep far.py --vary m=1:2:2"):
         assert main([*command.split(), "--hold", "speed=0.5"] if "run" in command else command.split()) == 0, command
     start = summary(here / "servoctl-runs" / "far")["start"]
@@ -243,8 +243,8 @@ def test_a_guess_frees_what_the_scene_holds(here, fall):
 
 def test_a_file_may_import_its_neighbours(here, fall, capsys):
     (here / "sub").mkdir()
-    (here / "sub" / "masses_of_fall.py").write_text("m = 4.0\n")
-    (here / "sub" / "other.py").write_text("import masses_of_fall\n" + FALL.replace("m=2.0", "m=masses_of_fall.m"))
+    (here / "sub" / "masses_of_fall.py").write_text("m = 4.0\n", encoding="utf-8")
+    (here / "sub" / "other.py").write_text("import masses_of_fall\n" + FALL.replace("m=2.0", "m=masses_of_fall.m"), encoding="utf-8")
     assert main(["report", "sub/other.py"]) == 0
     assert "m=4" in capsys.readouterr().out
 
@@ -269,7 +269,7 @@ def test_a_file_may_import_its_neighbours(here, fall, capsys):
     ],
 )  # fmt: skip
 def test_faults_in_a_users_file(here, capsys, text, facts):
-    (here / "broken.py").write_text(text)
+    (here / "broken.py").write_text(text, encoding="utf-8")
     assert main(["run", "broken.py"]) == 2
     out, err = capsys.readouterr()
     assert out == "" and "Traceback" not in err
@@ -302,7 +302,7 @@ def test_faults_in_a_users_file(here, capsys, text, facts):
     ],
 )
 def test_errors_are_told_without_a_traceback(here, fall, capsys, arguments, facts):
-    (here / "notes.txt").write_text("")
+    (here / "notes.txt").write_text("", encoding="utf-8")
     (here / "empty").mkdir()
     assert main(arguments.split()) == 2
     err = capsys.readouterr().err
@@ -335,7 +335,7 @@ def test_arguments_that_cannot_be_read(capsys, arguments, fact):
 
 @pytest.mark.parametrize("out", ["taken", "taken/deeper"])
 def test_a_folder_that_cannot_be_written_is_told_before_computing(here, fall, capsys, monkeypatch, out):
-    (here / "taken").write_text("a file")
+    (here / "taken").write_text("a file", encoding="utf-8")
     monkeypatch.setattr(servoctl, "derive", lambda *_: pytest.fail("computed first"))
     assert main(["run", fall, "--out", out]) == 2
     err = words(capsys.readouterr().err)
@@ -350,7 +350,7 @@ def test_a_folder_that_is_lost_while_computing_loses_nothing(here, fall, capsys,
 
     def losing(*args, **rest):
         shutil.rmtree(here / "lost")
-        (here / "lost").write_text("a file")
+        (here / "lost").write_text("a file", encoding="utf-8")
         return compute(*args, **rest)
 
     monkeypatch.setattr(servoctl, when, losing)
@@ -374,7 +374,7 @@ def test_nowhere_to_write_is_an_error_not_a_traceback(here, fall, capsys, monkey
 
 def test_files_of_an_earlier_run_are_replaced_and_others_kept(here, fall):
     assert main(["run", fall, "--out", "kept", "--no-verify"]) == 0
-    (here / "kept" / "notes.md").write_text("mine")
+    (here / "kept" / "notes.md").write_text("mine", encoding="utf-8")
     assert main(["run", fall, "--out", "kept", "--no-verify", "--no-figures"]) == 0
     assert {f.name for f in (here / "kept").iterdir()} == {
         "index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt", "notes.md"

@@ -7,6 +7,7 @@ import closed_forms as known
 import numpy as np
 import pytest
 from refusals import refused, warned
+from scipy.integrate import trapezoid
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize_scalar
 
@@ -336,7 +337,7 @@ def test_forward_motions_are_designed():
     for via in found.values["via"] + np.array([-0.01, 0.0, 0.01]):
         other = model.with_parameters(via=via)
         run = sv.simulate(other, other.start(), (0.0, 2.0))
-        costs.append(np.sqrt(np.trapezoid(run["pull"] ** 2, run.t) / 2.0))
+        costs.append(np.sqrt(trapezoid(run["pull"] ** 2, run.t) / 2.0))
     assert found.cost == pytest.approx(costs[1], rel=1e-5) and costs[1] < min(costs[0], costs[2])
     assert np.abs(found.plan["theta"]).max() <= np.radians(30.0)
 

@@ -21,14 +21,14 @@ REFERENCE = sorted((DOCS / "reference").glob("*.md"))
 COMMANDS = [
     (page.name, line.strip())
     for page in [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
-    for line in re.findall(r"^    (servoctl .*)$", page.read_text(), re.M)
+    for line in re.findall(r"^    (servoctl .*)$", page.read_text(encoding="utf-8"), re.M)
 ]
 SAME_MODULE, CONTENTS = {"plots": "figures"}, {"spec"}  # another name of a module; a module whose names are all in `sv`
 
 
 def contents(page):
     """Pages in the tables of contents of a page."""
-    tables = re.findall(r"```\{toctree\}\n(.*?)```", page.read_text(), re.S)
+    tables = re.findall(r"```\{toctree\}\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
     return sorted(line for table in tables for line in table.splitlines() if line and not line.startswith(":"))
 
 
@@ -36,7 +36,7 @@ def test_every_block_is_executed_or_printed_by_a_test():
     """Python by test_readme, C by test_export_c and test_export_law, other processes by test_sweep, other tools below, commands by .ci/run."""
     elsewhere = {"c_export.md": {"c", "cpp"}, "sweeps.md": {"py"}, "ten_lines.md": {"py", "modelica"}, "README.md": {"sh"}}
     for page in [ROOT / "README.md", *DOCS.glob("*.md")]:
-        kinds = set(re.findall(r"^```(\w+)", page.read_text(), re.M))
+        kinds = set(re.findall(r"^```(\w+)", page.read_text(encoding="utf-8"), re.M))
         assert kinds - elsewhere.get(page.name, set()) <= {"python", "text"}, page.name
 
 
@@ -44,7 +44,7 @@ def test_a_notebook_is_a_page_with_its_outputs(tmp_path):
     picture, code = {"image/png": "AAEC\n", "text/plain": ["<Figure>"]}, {"cell_type": "code", "source": ["a = 1\n", "a"]}
     printed = [{"output_type": "stream", "text": ["one\n", "two\n"]}, {"data": picture}, {"data": picture}, {"text": []}]
     cells = [{"cell_type": "markdown", "source": ["# Title"]}, {**code, "outputs": printed}]
-    (tmp_path / "name.ipynb").write_text(json.dumps({"cells": cells}))
+    (tmp_path / "name.ipynb").write_text(json.dumps({"cells": cells}), encoding="utf-8")
     page = runpy.run_path(str(DOCS / "conf.py"))["as_page"](tmp_path / "name.ipynb", tmp_path)
     shown = re.findall(r"!\[[^]]*\]\((.*?)\)", page)
     assert len(set(shown)) == 2 and all((tmp_path / name).read_bytes() == b"\0\1\2" for name in shown)
@@ -65,7 +65,7 @@ def test_every_page_is_in_a_table_of_contents_once():
 
 
 def test_the_reference_has_every_public_name_once():
-    text = "".join(page.read_text() for page in REFERENCE)
+    text = "".join(page.read_text(encoding="utf-8") for page in REFERENCE)
     listed = re.findall(r"^\.\. auto(\w+):: servoctl\.(\w+)$", text, re.M)
     names = [name for _, name in listed]
     assert sorted(names) == sorted((set(sv.__all__) | {"gallery"}) - CONTENTS - set(SAME_MODULE))
@@ -76,7 +76,7 @@ def test_the_reference_has_every_public_name_once():
 
 @pytest.mark.parametrize("page", REFERENCE, ids=lambda page: page.stem)
 def test_links_of_the_reference_lead_somewhere(page):
-    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text())
+    targets = re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8"))
     assert all((page.parent / target).exists() for target in targets)
 
 
@@ -94,12 +94,12 @@ TOOLS = {
     "MuJoCo": "mujoco",
     "python-control": "control",
 }
-TEN_LINES = (DOCS / "ten_lines.md").read_text()
+TEN_LINES = (DOCS / "ten_lines.md").read_text(encoding="utf-8")
 
 
 def column(tool):
     """Names in code in the cells of a tool, in all tables that have it as a heading."""
-    for block in re.findall(r"(?:^\|.*\n)+", (DOCS / "names_elsewhere.md").read_text(), re.M):
+    for block in re.findall(r"(?:^\|.*\n)+", (DOCS / "names_elsewhere.md").read_text(encoding="utf-8"), re.M):
         rows = [[cell.strip() for cell in line.strip("|\n ").split("|")] for line in block.splitlines()]
         if tool in rows[0]:
             yield from (name for row in rows[2:] for name in re.findall("`([^`]+)`", row[rows[0].index(tool)]))

@@ -34,7 +34,7 @@ def test_every_example_is_verified_and_returns_numbers(numbers, path):
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
 def test_every_example_explains_itself_and_runs_as_a_script(path):
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     assert text.startswith('"""')
     assert 'if __name__ == "__main__":' in text
 
@@ -208,7 +208,7 @@ def test_closed_loops_show_what_computed_actuation_cannot_do(numbers):
 
 
 def test_the_table_of_other_machines_is_what_the_example_says(numbers):
-    result, page = numbers("closed_loops"), (EXAMPLES.parent / "docs" / "closed_loop.md").read_text()
+    result, page = numbers("closed_loops"), (EXAMPLES.parent / "docs" / "closed_loop.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.M)
     assert [row[0] for row in rows] == list(MACHINES)
     for name, *cells in rows:
@@ -218,7 +218,7 @@ def test_the_table_of_other_machines_is_what_the_example_says(numbers):
 
 
 def test_the_page_of_examples_has_all_of_them_and_their_numbers(numbers):
-    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", (EXAMPLES.parent / "docs" / "examples.md").read_text(), re.M)
+    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", (EXAMPLES.parent / "docs" / "examples.md").read_text(encoding="utf-8"), re.M)
     assert sorted(name for name, _ in rows) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
     shown = [(name, *number) for name, cell in rows for number in re.findall(r"`([^`]+)` (-?[\d.]*\d)", cell)]
     assert len(shown) > 20

@@ -36,7 +36,7 @@ class Exported:
         command = [*shlex.split(compiler()), *STRICT, "-fPIC", "-shared", str(source), "-o", str(library), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (0, "")
-        self.library, self.name, self.header = ctypes.CDLL(str(library)), name, header.read_text()
+        self.library, self.name, self.header = ctypes.CDLL(str(library)), name, header.read_text(encoding="utf-8")
 
     def __call__(self, function, *arguments):
         call = [
@@ -66,7 +66,7 @@ def test_feedforward_in_floats_is_that_of_doubles_to_six_digits(name, gallery_mo
     for k, t in enumerate(times):
         assert plan("feedforward", ctypes.c_float(t), x, p, z, u) >= 0
         assert np.abs(u - wanted[:, k]).max() < 2e-5 * np.abs(wanted).max()
-    assert "double" not in re.sub(r"/\*.*?\*/", "", (tmp_path / "plan.c").read_text(), flags=re.DOTALL)
+    assert "double" not in re.sub(r"/\*.*?\*/", "", (tmp_path / "plan.c").read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 @pytest.mark.parametrize("name", ["overhead-crane", "passive-arm"])
@@ -164,8 +164,8 @@ def test_feedforward_without_a_solution_says_so_and_changes_no_output(gallery_mo
 
 
 def test_files_are_the_same_each_time(gallery_model, tmp_path):
-    first = [f.read_text() for f in export_c(gallery_model("vtol"), tmp_path / "a", name="vtol")]
-    assert first == [f.read_text() for f in export_c(gallery_model("vtol"), tmp_path / "b", name="vtol")]
+    first = [f.read_text(encoding="utf-8") for f in export_c(gallery_model("vtol"), tmp_path / "a", name="vtol")]
+    assert first == [f.read_text(encoding="utf-8") for f in export_c(gallery_model("vtol"), tmp_path / "b", name="vtol")]
 
 
 def test_the_program_of_the_docs_prints_what_python_computes(gallery_model, tmp_path):
@@ -173,8 +173,8 @@ def test_the_program_of_the_docs_prints_what_python_computes(gallery_model, tmp_
     times = 0.1 * np.arange(81)
     run = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0), t_eval=times)
     source, _ = export_c(gallery_model("overhead-crane"), tmp_path, name="crane", start=model.start(guess={"l": 4.0}))
-    text = (Path(__file__).parents[1] / "docs" / "c_export.md").read_text()
-    (tmp_path / "main.c").write_text(re.search(r"```c\n(.*?)```", text, re.S)[1])
+    text = (Path(__file__).parents[1] / "docs" / "c_export.md").read_text(encoding="utf-8")
+    (tmp_path / "main.c").write_text(re.search(r"```c\n(.*?)```", text, re.S)[1], encoding="utf-8")
     program = tmp_path / "program"
     command = [*shlex.split(compiler()), *STRICT, str(tmp_path / "main.c"), str(source), "-o", str(program), "-lm"]
     subprocess.run(command, check=True, capture_output=True)
@@ -282,7 +282,7 @@ def test_a_start_for_a_law_is_refused(gallery_model, tmp_path):
 
 
 def test_a_folder_that_is_a_file_is_refused(gallery_model, tmp_path):
-    (tmp_path / "taken").write_text("")
+    (tmp_path / "taken").write_text("", encoding="utf-8")
     with refused(ServoError, path=str(tmp_path / "taken")):
         export_c(gallery_model("two-cars"), tmp_path / "taken")
 

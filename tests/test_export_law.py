@@ -72,7 +72,7 @@ def library(law, folder):
     command = [*shlex.split(compiler()), *STRICT, "-fPIC", "-shared", str(source), "-o", str(shared), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    return ctypes.CDLL(str(shared)), header.read_text()
+    return ctypes.CDLL(str(shared)), header.read_text(encoding="utf-8")
 
 
 class InC:
@@ -127,7 +127,7 @@ def test_a_loop_closed_by_the_c_file_is_the_loop_of_the_law(name, plan, tmp_path
 def test_the_table_is_a_constant_and_indices_have_names(plan, tmp_path):
     law = sv.lqr(plan, sv.plant(CRANE), integral=True)
     _, header = library(law, tmp_path)
-    source = (tmp_path / "loop.c").read_text()
+    source = (tmp_path / "loop.c").read_text(encoding="utf-8")
     for name in law.measures:
         assert re.search(rf"LOOP_Y_{name} = {law.measures.index(name)}\b", header)
     assert "LOOP_Z_integral_of_X" in header and "LOOP_U_hoist" in header
@@ -203,7 +203,7 @@ def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):
         pytest.skip("needs g++")
     source, header = sv.export_c(sv.lqr(plan, sv.plant(CRANE)), tmp_path, name="loop", thinned=1e-4)
     (tmp_path / "main.cpp").write_text(
-        '#include "loop.h"\nint main() { double y[LOOP_NY] = {}, z[1], u[LOOP_NU]; loop_start(z); return loop_step(0, y, z, u); }\n'
+        '#include "loop.h"\nint main() { double y[LOOP_NY] = {}, z[1], u[LOOP_NU]; loop_start(z); return loop_step(0, y, z, u); }\n', encoding="utf-8"
     )
     for command in (["gcc", "-std=c99", "-c", str(source), "-o", str(tmp_path / "loop.o")],
                     ["g++", "-Wall", "-Wextra", str(tmp_path / "main.cpp"), str(tmp_path / "loop.o"), "-o", str(tmp_path / "run")],
@@ -255,10 +255,10 @@ int main()
 def test_the_controller_of_the_documents_gives_the_commands_of_the_law(plan, tmp_path):
     if which("g++") is None:
         pytest.skip("needs g++")
-    page = (Path(__file__).parents[1] / "docs" / "c_export.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "c_export.md").read_text(encoding="utf-8")
     (shown,) = re.findall(r"```cpp\n(.*?)```", page, re.S)
     source, _ = sv.export_c(sv.lqr(plan, sv.plant(CRANE), integral=True), tmp_path, name="loop", thinned=1e-4)
-    (tmp_path / "main.cpp").write_text(ROS % shown)
+    (tmp_path / "main.cpp").write_text(ROS % shown, encoding="utf-8")
     for command in (["gcc", "-std=c99", "-c", str(source), "-o", str(tmp_path / "loop.o")],
                     ["g++", "-std=c++17", "-Wall", "-Wextra", str(tmp_path / "main.cpp"), str(tmp_path / "loop.o"), "-lm",
                      "-o", str(tmp_path / "run")],
@@ -313,7 +313,7 @@ def test_a_law_in_c_runs_without_a_complaint_of(kind, real, tool, plan, tmp_path
     text = DRIVER
     for word, fact in facts.items():
         text = text.replace(word, fact)
-    (tmp_path / "main.c").write_text(text)
+    (tmp_path / "main.c").write_text(text, encoding="utf-8")
     flags = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"] if tool == "sanitizers" else ["-g"]
     run = tmp_path / "run"
     built = subprocess.run(["gcc", "-std=c99", *flags, str(tmp_path / "main.c"), str(source), "-o", str(run), "-lm"],

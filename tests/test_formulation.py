@@ -50,7 +50,7 @@ def test_the_accelerations_are_those_of_the_model():
 
 
 def test_the_documentation_prints_these_operations(joints, bodies):
-    text = DOC.read_text()
+    text = DOC.read_text(encoding="utf-8")
     assert joints.table() in text
     assert bodies.table() in text
 

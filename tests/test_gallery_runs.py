@@ -30,7 +30,7 @@ def drawn(monkeypatch):
 def test_a_scene_runs_and_leaves_a_page_with_figures_that_can_be_read(name, drawn, tmp_path, capsys):
     code = main(["run", name, "--out", str(tmp_path)])
     assert code == (1 if name in ENDS_EARLY else 0), capsys.readouterr().out
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["scene"]["name"] == name and (tmp_path / "index.html").stat().st_size < 2e6
     assert {"coordinates.png", "residuals.png", "motion.png"} <= set(drawn)
     assert not {figure: sentences for figure, sentences in drawn.items() if sentences}

@@ -247,7 +247,7 @@ def test_a_damaged_entry_is_derived_anew(derived, tmp_path, damage):
 
 
 def test_without_a_directory_everything_is_derived(derived, tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("no directory")
+    (tmp_path / "file").write_text("no directory", encoding="utf-8")
     monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path / "file" / "cache"))
     for count in (1, 2):
         assert sv.derive(*pendulum()).flat
@@ -368,7 +368,7 @@ def test_sources_that_changed_are_other_sources(monkeypatch, tmp_path):
     stamp = store._stamp.__wrapped__
     file = tmp_path / "package" / "model" / "store.py"
     file.parent.mkdir(parents=True)
-    file.write_text("a = 1")
+    file.write_text("a = 1", encoding="utf-8")
     monkeypatch.setattr(store, "__file__", str(file))
     monkeypatch.setattr(store, "_LOADED", file.stat().st_ctime - 1)
     assert stamp() is None  # changed after it was loaded
@@ -377,10 +377,10 @@ def test_sources_that_changed_are_other_sources(monkeypatch, tmp_path):
     assert len(found) == 1 and None not in found
     os.utime(file, ns=(1, 1))
     found.add(stamp())
-    file.write_text("a = 12")
+    file.write_text("a = 12", encoding="utf-8")
     os.utime(file, ns=(1, 1))
     found.add(stamp())
-    (tmp_path / "package" / "new.py").write_text("")
+    (tmp_path / "package" / "new.py").write_text("", encoding="utf-8")
     found.add(stamp())
     assert len(found) == 4
 

@@ -16,8 +16,8 @@ from servoctl.reduction.rows import dependence
 from servoctl.tolerances import EXTENDED
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "numbers.md").read_text()
-TESTS = "\n".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+PAGE = (ROOT / "docs" / "numbers.md").read_text(encoding="utf-8")
+TESTS = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
 
 
 def table():
@@ -56,7 +56,7 @@ def test_the_tests_that_the_page_names_exist():
 
 def numbers_of(module):
     """Names of a module's own constants that are numbers."""
-    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text())
+    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8"))
     constants = importlib.import_module(module)
     targets = [target for node in tree.body if isinstance(node, ast.Assign) for target in node.targets]
     names = [name.id for target in targets for name in (target.elts if isinstance(target, ast.Tuple) else [target])]

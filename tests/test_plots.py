@@ -289,7 +289,7 @@ def test_a_run_of_one_sample_is_drawn(tmp_path):
 
 
 def test_a_folder_that_cannot_be_written(run, tmp_path):
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", encoding="utf-8")
     with refused(ServoError, path=str(tmp_path / "file")):
         plots.save_figures(run, tmp_path / "file")
 

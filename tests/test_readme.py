@@ -33,12 +33,12 @@ pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 def blocks(page, language):
-    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
 
 
 def table(page, first):
     """Rows of the table whose first heading is `first`: {first cell: other cells}."""
-    lines = page.read_text().split(f"| {first} |")[1].split("\n\n")[0].splitlines()[2:]
+    lines = page.read_text(encoding="utf-8").split(f"| {first} |")[1].split("\n\n")[0].splitlines()[2:]
     cells = [[cell.strip() for cell in line.strip("| ").split("|")] for line in lines]
     return {row[0]: row[1:] for row in cells}
 
@@ -72,7 +72,7 @@ def test_the_readme_has_two_commands_and_shows_python():
 
 @pages
 def test_links_and_named_files_exist(page):
-    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
     for target in re.findall(r"\]\(([^)#]+)\)", text):
         assert (page.parent / target).exists(), target
     for name in re.findall(r"`((?:docs|examples|notebooks|tests)/[\w./]*|[\w/]+\.(?:md|cff|ipynb|py))`", text):

@@ -416,7 +416,8 @@ ONE_ZERO = {  # residuals of which one factor alone has zeros near x = y = 0
 @pytest.mark.parametrize("name", ONE_ZERO)
 def test_a_residual_that_holds_by_one_factor_is_no_cause_for_a_warning(name):
     mechanism, symbols = plane_products()
-    with warnings.catch_warnings(action="error"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         derive(mechanism, sv.Program({"a": ONE_ZERO[name](*symbols)}, by="ideal"))
 
 
@@ -426,13 +427,15 @@ def test_a_guess_far_from_the_zeros_of_a_factor_decides():
     program = sv.Program({"a": length * (angle - ca.sin(t))}, by="ideal")
     with warned("'a'", "x or (y-sin(t))"):
         derive(mechanism, program)
-    with warnings.catch_warnings(action="error"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         derive(mechanism, program, guess={"x": 4.0})
 
 
 @pytest.mark.parametrize("name", gallery)
 def test_no_scene_of_the_gallery_has_a_residual_that_holds_by_either_of_two_factors(name):
-    with warnings.catch_warnings(action="error"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         scene = gallery[name]
         derive(*scene.build())
 

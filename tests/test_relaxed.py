@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
-from scipy.integrate import solve_ivp
+from scipy.integrate import solve_ivp, trapezoid
 from scipy.optimize import approx_fprime
 from test_bounded import flexible_link
 
@@ -145,7 +145,7 @@ def test_effort_is_counted_from_the_wish(crane, coarse):
     run = sv.relaxed(plant, wish, (0.0, 6.0), weight=1e-6)
 
     def cost(run):
-        return np.trapezoid(run.residual["X"][0] ** 2 / 1e-6 + (run["cart"] - 60 * np.sin(4 * run.t)) ** 2, run.t)
+        return trapezoid(run.residual["X"][0] ** 2 / 1e-6 + (run["cart"] - 60 * np.sin(4 * run.t)) ** 2, run.t)
 
     assert cost(run) < 0.99 * cost(coarse)
 

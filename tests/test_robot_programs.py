@@ -143,7 +143,7 @@ ROD = (
 def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
     """Two cranks move the point where two chains meet: along a line, by the motors at the ground alone."""
     path = tmp_path / "five_bar.urdf"
-    path.write_text(FIVE_BAR.format(sides="".join(SIDE.format(s=s, x=x, rod=ROD) for s, x in (("left", -0.1), ("right", 0.1)))))
+    path.write_text(FIVE_BAR.format(sides="".join(SIDE.format(s=s, x=x, rod=ROD) for s, x in (("left", -0.1), ("right", 0.1)))), encoding="utf-8")
     robot = sv.urdf(path)
     ends = robot.frame("left_end"), robot.frame("right_end")
     mechanism = robot.mechanism(sv.loop(*ends, "position"), actuators=("left_motor", "right_motor"))
@@ -166,7 +166,7 @@ def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
 
 
 def test_frames_that_cannot_meet_are_refused():
-    text = open(robots.file_of("four_bar")).read().replace('xyz="0.5 0 0"', 'xyz="0.5 0.1 0"')
+    text = open(robots.file_of("four_bar"), encoding="utf-8").read().replace('xyz="0.5 0 0"', 'xyz="0.5 0.1 0"')
     arm = sv.urdf(text)
     with refused(sv.SpecificationError, "loop_y", row="loop_y"):
         sv.loop(arm.frame("coupler_end"), arm.frame("rocker_end"), "position")

@@ -65,7 +65,7 @@ def test_the_force_of_index_5_has_a_step_of_least_error(gallery_model):
     for method, order in (("BE", 1), ("BDF2", 2)):
         found = study.best("servo", method)
         assert found["order"] == pytest.approx(order, abs=0.1)
-        printed = re.search(rf"two-cars .*servo \| {method} .* ([\d.]+) \| (\S+) \|", DOC.read_text())
+        printed = re.search(rf"two-cars .*servo \| {method} .* ([\d.]+) \| (\S+) \|", DOC.read_text(encoding="utf-8"))
         assert float(printed[1]) == pytest.approx(found["step"], rel=0.01)
         assert float(printed[2]) == pytest.approx(found["force"], rel=0.3)  # rounding differs among machines
     best = study.best("servo", "BDF2")

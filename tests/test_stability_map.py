@@ -75,7 +75,7 @@ def test_poles_faster_than_the_internal_dynamics_decide(stiff, method):
 def test_the_documentation_prints_this_map():
     model = sv.derive(*mass_on_car(damping=10.0))
     run = sv.simulate(model, model.start(s=0.0, ds=0.0), (0.0, 6.0))
-    assert repr(stability(model, run)) in DOC.read_text()
+    assert repr(stability(model, run)) in DOC.read_text(encoding="utf-8")
 
 
 def test_a_flat_program_has_steps_to_fear_only_where_poles_are_given(gallery_model):

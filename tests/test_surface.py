@@ -82,7 +82,7 @@ def test_public_names_exist_once_and_in_order():
 def test_type_checkers_see_the_public_names():
     """The stub, executed, binds the objects that the package gives on use, and no others."""
     seen = {}
-    exec(PACKAGE.joinpath("__init__.pyi").read_text(), seen)
+    exec(PACKAGE.joinpath("__init__.pyi").read_text(encoding="utf-8"), seen)
     public = {name: thing for name, thing in seen.items() if name not in ("__builtins__", "__doc__")}
     assert set(public) == {*sv.__all__, "__version__"}
     assert [name for name, thing in public.items() if getattr(sv, name) is not thing] == []
@@ -400,13 +400,13 @@ def test_every_room_is_in_the_documents():
     rooms = {layer(path) for path in FILES if relative(path) not in ENTRIES}
     root = PACKAGE.parent
     for page, opening in (("CONTRIBUTING.md", "## Layout"), ("docs/architecture.md", "| room |")):
-        text = (root / page).read_text()
+        text = (root / page).read_text(encoding="utf-8")
         words = set(re.findall(r"\w+", text[text.index(opening) :].split("\n## ")[0]))
         assert rooms - words == set(), page
 
 
 def test_nothing_is_left_open():
-    assert offenders(lambda path: re.findall(r"\b(?:TODO|FIXME|XXX|NotImplementedError)\b", path.read_text())) == {}
+    assert offenders(lambda path: re.findall(r"\b(?:TODO|FIXME|XXX|NotImplementedError)\b", path.read_text(encoding="utf-8"))) == {}
 
 
 def test_the_linter_finds_nothing():

@@ -116,8 +116,8 @@ def test_shards_merge_to_the_whole(loops):
 
 def test_the_script_of_the_docs_runs(tmp_path, monkeypatch, capsys):
     """With threads in place of its processes, which the tests above start."""
-    text = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text()
-    (tmp_path / "loops.py").write_text(re.search(r"```python\n(.*?)\n\nstudy", text, re.S)[1] + "\n")
+    text = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
+    (tmp_path / "loops.py").write_text(re.search(r"```python\n(.*?)\n\nstudy", text, re.S)[1] + "\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     script = re.search(r"```py\n(.*?)```", text, re.S)[1]
     for processes, threads in (
@@ -241,7 +241,7 @@ def test_a_pool_that_dies_leaves_what_was_finished(tmp_path):
     assert set(study["error"][5:]) == {"BrokenProcessPool"}
     assert "did not finish this case" in study["message"][7]
     assert "7 not finished by the executor" in study.meta["message"]
-    assert len(kept.read_text().splitlines()) == 1 + len(done), "what was lost is computed again"
+    assert len(kept.read_text(encoding="utf-8").splitlines()) == 1 + len(done), "what was lost is computed again"
 
 
 def test_a_pool_that_dies_at_once_is_an_error():
@@ -305,8 +305,8 @@ def test_a_sweep_goes_on_where_its_checkpoint_ends(tmp_path):
     kept, cases = tmp_path / "folder" / "kept.jsonl", sv.grid(m=range(6))
     whole = sv.sweep(Counting(), cases, seed=1)
     assert len(sv.sweep(Counting(stop=4), cases, seed=1, checkpoint=kept)) == 4
-    text = kept.read_text()
-    kept.write_text(text[:-9])  # the last line was cut off when the machine lost its power
+    text = kept.read_text(encoding="utf-8")
+    kept.write_text(text[:-9], encoding="utf-8")  # the last line was cut off when the machine lost its power
     again = Counting()
     assert same(whole, sv.sweep(again, cases, seed=1, checkpoint=kept))
     assert again.called == [3, 4, 5]
@@ -316,7 +316,7 @@ def test_a_sweep_goes_on_where_its_checkpoint_ends(tmp_path):
 def test_a_failure_is_not_tried_again(tmp_path):
     first = sv.sweep(picky, sv.grid(m=[1, 2]), checkpoint=tmp_path / "kept")
     assert same(first, sv.sweep(picky, sv.grid(m=[1, 2]), checkpoint=tmp_path / "kept"))
-    assert len((tmp_path / "kept").read_text().splitlines()) == 3
+    assert len((tmp_path / "kept").read_text(encoding="utf-8").splitlines()) == 3
 
 
 @pytest.mark.parametrize(
@@ -327,10 +327,10 @@ def test_a_failure_is_not_tried_again(tmp_path):
 def test_the_checkpoint_of_another_sweep_is_refused(tmp_path, case, cases, seed):
     kept = tmp_path / "kept"
     sv.sweep(Counting(), {"m": [1, 2]}, seed=1, checkpoint=kept)
-    text = kept.read_text()
+    text = kept.read_text(encoding="utf-8")
     with refused(SpecificationError, path=str(kept)):
         sv.sweep(case, cases, seed=seed, checkpoint=kept)
-    assert kept.read_text() == text
+    assert kept.read_text(encoding="utf-8") == text
 
 
 def test_a_function_of_the_same_name_in_another_module_is_another_sweep():
@@ -349,10 +349,10 @@ def test_a_function_of_the_same_name_in_another_module_is_another_sweep():
 
 @pytest.mark.parametrize("text", ["hello\n", "[]\n", "{}\n"])
 def test_a_file_that_is_no_checkpoint_is_left_alone(tmp_path, text):
-    (tmp_path / "notes").write_text(text)
+    (tmp_path / "notes").write_text(text, encoding="utf-8")
     with refused(SpecificationError, path=str(tmp_path / "notes")):
         sv.sweep(halves, {"m": [1]}, checkpoint=tmp_path / "notes")
-    assert (tmp_path / "notes").read_text() == text
+    assert (tmp_path / "notes").read_text(encoding="utf-8") == text
 
 
 def test_a_checkpoint_that_cannot_be_opened_is_told(tmp_path):
@@ -435,7 +435,7 @@ def case(m, rng):
 
 @pytest.fixture
 def here(here):
-    (here / "own.py").write_text(OWN)
+    (here / "own.py").write_text(OWN, encoding="utf-8")
     return here
 
 
@@ -445,7 +445,7 @@ def test_the_command_varies_parameters_of_a_scene(here, capsys):
     assert study["m1"].tolist() == [1.0, 1.0, 1.5, 1.5, 2.0, 2.0] and study["k1"].tolist() == [1.0, 2.0] * 3
     assert sorted(p.name for p in Path("out").iterdir()) == [f"sweep.{s}" for s in ("csv", "json", "npz", "png")]
     assert "6 of 6 cases finished" in capsys.readouterr().out
-    assert json.loads(Path("out/sweep.json").read_text())["parameters"] == ["m1", "k1"]
+    assert json.loads(Path("out/sweep.json").read_text(encoding="utf-8"))["parameters"] == ["m1", "k1"]
 
 
 def test_shards_of_the_command_merge_to_the_table_of_one_process(here):
@@ -471,12 +471,12 @@ def test_the_command_on_two_processes_gives_the_same_bits(here):
 def test_the_command_resumes_and_does_not_throw_work_away(here, capsys):
     own = ["sweep", "own.py", "--vary", "m=1,2,3", "--monte-carlo", "1", "--seed", "3", "--out", "out"]
     text = OWN.replace("if m == 4:", 'if m == 3 and not __import__("os").path.exists("go"):')
-    (here / "own.py").write_text(text.replace('ValueError("four")', "KeyboardInterrupt"))
+    (here / "own.py").write_text(text.replace('ValueError("four")', "KeyboardInterrupt"), encoding="utf-8")
     assert main(own) == 1
     assert "interrupted" in capsys.readouterr().out and Path("out/sweep.jsonl").exists()
     assert main(own) == 2
     assert "--resume" in capsys.readouterr().err
-    (here / "go").write_text("")
+    (here / "go").write_text("", encoding="utf-8")
     assert main([*own, "--resume"]) == 0
     assert sv.load_study("out/sweep.npz").meta["message"] == "3 of 3 cases finished"
     assert not Path("out/sweep.jsonl").exists()

@@ -182,7 +182,7 @@ def test_an_exported_plan_has_the_tables(real, tmp_path, c_compiler):
     for t, force in zip(run.t, run["F"], strict=True):
         assert step(number(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (x, parameters, z, u))) >= 0
         assert abs(u[0] - force) < (1e-10 if real == "double" else 1e-3) * np.abs(run["F"]).max()
-    assert source.read_text().count("static double row(") + source.read_text().count("static float row(") == 1
+    assert source.read_text(encoding="utf-8").count("static double row(") + source.read_text(encoding="utf-8").count("static float row(") == 1
 
 
 # tables of data --------------------------------------------------------------------------------------------------------

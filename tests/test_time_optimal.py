@@ -5,6 +5,7 @@ import closed_forms
 import numpy as np
 import pytest
 from refusals import refused
+from scipy.integrate import trapezoid
 from scipy.optimize import brentq
 
 import servoctl as sv
@@ -23,7 +24,7 @@ def active(law, limits):
         size = max(abs(side) for side in (low, high) if side is not None)
         values = plan[name] if name in plan.names else np.interp(plan.t, *rate(plan, name[1:]))
         on |= (values > high - NEAR * size) | (values < low + NEAR * size)
-    return np.trapezoid(on.astype(float), plan.t) / np.ptp(plan.t)
+    return trapezoid(on.astype(float), plan.t) / np.ptp(plan.t)
 
 
 def rate(plan, name):

@@ -240,7 +240,7 @@ def test_a_table_has_even_columns(tmp_path):
         table.column("c")
     with refused(ServoError, "none.npz"):
         load_study(tmp_path / "none.npz")
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").write_text("", encoding="utf-8")
     with refused(ServoError, "a.csv"):
         table.csv(tmp_path / "file" / "a.csv")
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 def checked(script, folder):
     """Exit code and errors of mypy, with its default settings."""
     needs("mypy")
-    (folder / "script.py").write_text(script)
+    (folder / "script.py").write_text(script, encoding="utf-8")
     command = [sys.executable, "-m", "mypy", "--follow-imports=silent", "--cache-dir", str(folder.parent), "script.py"]
     environment = os.environ | {"MYPYPATH": str(ROOT)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
@@ -26,7 +26,7 @@ def test_the_package_says_that_it_is_typed():
 
 
 def test_the_readme_is_accepted(tmp_path):
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
     assert checked("\n".join(blocks), tmp_path) == (0, [])
 
 

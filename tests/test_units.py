@@ -181,10 +181,10 @@ def test_printed_values_have_units(plan, loop):
 
 def test_headers_in_c_have_units(plan, loop, tmp_path):
     sv.export_c(plan.model, tmp_path, name="crane")
-    header = (tmp_path / "crane.h").read_text()
+    header = (tmp_path / "crane.h").read_text(encoding="utf-8")
     assert "CRANE_X_dtheta = 5, /* [rad/s] */" in header and "CRANE_U_trolley = 0, /* [N] */" in header
     sv.export_c(loop.law, tmp_path, name="law")
-    assert "LAW_Y_dl = 4, /* [m/s] */" in (tmp_path / "law.h").read_text()
+    assert "LAW_Y_dl = 4, /* [m/s] */" in (tmp_path / "law.h").read_text(encoding="utf-8")
 
 
 # --- tables

@@ -4,7 +4,7 @@
     python tests/tiers.py arcs      what the first case of each function executes, by coverage
     python tests/tiers.py write     the lists: tests/left.txt, tests/by_hand.txt
 
-Measurements are added to a folder, by default `tiers` in the system's folder for temporary files. A test that was
+Further arguments are pytest's. Measurements are added to a folder, by default `tiers` in the system's folder for temporary files. A test that was
 skipped in any of them, such as for an extra that is not installed, is in no first tier. The first two tiers
 have what executes most new arcs of the package per second, until their time is spent; a case counts as an arc.
 """
@@ -82,11 +82,11 @@ def function(nodeid):
     return nodeid.partition("[")[0].removeprefix("tests/")
 
 
-def measure(kind):
+def measure(kind, options):
     """Run every test, or the first case of each function, in two processes."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "PYTHONPATH": str(TESTS), "SERVOCTL_TIERS": str(FOLDER), "SERVOCTL_TIERS_KIND": kind}
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--all", "-p", "tiers"]
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--all", "-p", "tiers", *options]
     return subprocess.run(command, cwd=TESTS.parent, env=environment, check=False).returncode
 
 
@@ -127,7 +127,7 @@ def chosen(costs, gains, seen, budget):
 
     What a name gains only falls as others are taken, so that the heap holds bounds of it.
     """
-    heap, taken = [(-math.inf, name) for name in costs], []
+    heap, taken = [(-math.inf, name) for name in costs], set()
     heapq.heapify(heap)
     while heap:
         _, name = heapq.heappop(heap)
@@ -138,8 +138,8 @@ def chosen(costs, gains, seen, budget):
         elif costs[name] <= budget:
             budget -= costs[name]
             seen |= arcs
-            taken.append(name)
-    return set(taken)
+            taken.add(name)
+    return taken
 
 
 def write():
@@ -169,8 +169,8 @@ def write():
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("step", choices=("times", "arcs", "write"))
-    step = parser.parse_args().step
-    return write() if step == "write" else measure(step)
+    known, options = parser.parse_known_args()
+    return write() if known.step == "write" else measure(known.step, options)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def rooms():
         name = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         if name.startswith("__"):
             continue
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
         lines[name] = lines.get(name, 0) + len(text.splitlines())
         nodes = list(ast.walk(ast.parse(text)))
         modules = [n.module for n in nodes if isinstance(n, ast.ImportFrom) and n.module]

@@ -95,7 +95,7 @@ def _identified(chosen, cc, path):
         return None, None
     for variable, candidate in (("SERVOCTL_COMPILER", chosen), ("CC", cc), *(("", name) for name in USUAL)):
         try:
-            command = shlex.split(candidate or "")
+            command = shlex.split(candidate or "", posix=os.name == "posix")  # else a backslash separates folders
         except ValueError:  # a quotation mark that is not closed
             command = (candidate or "").split()
         if command and (program := shutil.which(command[0], path=path)):

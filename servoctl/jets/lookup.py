@@ -37,12 +37,12 @@ class Lookup:
     @classmethod
     def of_knots(cls, knots):
         """The lookup of the number of ascending knots (n,) that s has reached."""
-        knots, n = np.asarray(knots, dtype=float), len(knots)
+        knots = np.asarray(knots, dtype=float)
         name = _name("knots", knots)
         if name not in made:
             s = ca.MX.sym("s")
-            rows = _line([-BEYOND, *np.repeat(knots, 2), BEYOND], np.repeat(np.arange(n + 1.0), 2).tolist())
-            made[name], _contents[name] = _opaque(name, s, [ca.floor(rows(s) + 0.5), _list(knots)(s)]), knots
+            reached = ca.low(ca.DM([-BEYOND, *knots, BEYOND]), s)
+            made[name], _contents[name] = _opaque(name, s, [reached, _list(knots)(s)]), knots
         return cls(made[name])
 
     @classmethod
@@ -138,13 +138,6 @@ def _opaque(name, argument, values):
 
 def _name(kind, numbers):
     return f"{kind}_{len(numbers)}_{hashlib.sha256(numbers.tobytes()).hexdigest()[:16]}"
-
-
-def _line(knots, values):
-    """The function of straight lines through values at knots; CasADi adds up values at the first and the last."""
-    before, after = knots[0] - abs(knots[0]) - 1, knots[-1] + abs(knots[-1]) + 1
-    outside = [before - abs(before), before, *knots, after, after + abs(after)]
-    return ca.Function.bspline("line", [outside], [values[0], *values, values[-1]], [1], 1, {})
 
 
 def _list(numbers):

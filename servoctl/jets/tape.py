@@ -21,8 +21,8 @@ from servoctl.tolerances import LAST_EXPONENT
 REAL = np.longdouble
 MOST_SQUARED = 64  # the largest whole exponent that is written as squares and products
 
-# Mode 0 is CasADi's default: NumPy's functions of symbols work, each with a warning. Mode -1 gives no warning.
-if ca.GlobalOptions.getNumpyMode() == 0:
+# Mode 0 is the default of CasADi 3.8: NumPy's functions of symbols work, each with a warning. Mode -1 gives no warning.
+if hasattr(ca.GlobalOptions, "getNumpyMode") and ca.GlobalOptions.getNumpyMode() == 0:
     ca.GlobalOptions.setNumpyMode(-1)
 
 _NUMPY = {

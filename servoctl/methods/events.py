@@ -54,7 +54,7 @@ class Event:
             )
         object.__setattr__(self, "value", finite("value", self.value))
         object.__setattr__(self, "direction", float(np.sign(finite("direction", self.direction))))
-        if not isinstance(self.terminal, (bool, np.bool)):
+        if not isinstance(self.terminal, (bool, np.bool_)):
             object.__setattr__(self, "terminal", whole("terminal", self.terminal))
 
     @property

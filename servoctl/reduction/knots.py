@@ -106,7 +106,7 @@ class Switches:
         instants, others = self._affine(values)
         times = self._times(values, instants, others, span)
         knots = Knots(tuple(times), self.classes(values, needs, times))
-        self._known[*key, span if others else "any span"] = knots
+        self._known[(*key, span if others else "any span")] = knots
         if len(self._known) > KNOWN:
             self._known.pop(next(iter(self._known)), None)
         return knots

@@ -187,13 +187,13 @@ def _refuse_square(q, row, context, slopes=None):
     start = sample(q, [], row.order, context)
     flow = Flow(q, [row], row.order, start)
     z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
-    sizes = []
-    for jets in (start.z, z):
-        values, _ = replace(start, z=jets).matrix(gradient)
-        sizes.append(np.abs(values).max(axis=(0, 1)))
-    solved = residual < SOLVED
-    if solved.any() and np.all(sizes[1][solved] < VANISHED * sizes[0][solved]):
-        if not _regular_nearby(flow, row, replace(start, z=z).take(np.flatnonzero(solved))):
+    end = replace(start, z=z)
+    before, after = (np.abs(points.matrix(gradient)[0]).max(axis=(0, 1)) for points in (start, end))
+    # So does one that changes by its own size as far as the rounding of the row's terms moves the solution.
+    way, left = np.abs(z - start.z).max(axis=0), ROUNDED * values_and_sizes(row, end)[1][0]
+    vanished, solved = (after < VANISHED * before) | (after**2 * way < left * before), residual < SOLVED
+    if solved.any() and vanished[solved].all():
+        if not _regular_nearby(flow, row, end.take(np.flatnonzero(solved))):
             raise vanishing_gradient(q, row, context, _repeated(factors(row.expression)))
 
 

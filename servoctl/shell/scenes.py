@@ -32,9 +32,9 @@ def find_scene(given):
         return path.stem, _from_file(path)
     error = unknown(given, gallery, "scene")
     if os.path.isfile(f"{given}.py"):
-        error.add_note(f"There is a file {given}.py: give the name with its suffix.")
+        error.__notes__ = [f"There is a file {given}.py: give the name with its suffix."]
     elif os.path.exists(given):
-        error.add_note(f"{given} exists, but a scene's file ends in .py.")
+        error.__notes__ = [f"{given} exists, but a scene's file ends in .py."]
     raise error
 
 
@@ -110,7 +110,7 @@ def _reported(path, action):
         return action()
     except ServoError as error:
         line, text = _place(error, path)
-        error.add_note(f"Raised in {path}, line {line}: {text}")
+        error.__notes__ = [*getattr(error, "__notes__", ()), f"Raised in {path}, line {line}: {text}"]
         raise
     except (Exception, SystemExit) as error:
         line, text = _place(error, path)

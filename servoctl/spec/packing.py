@@ -63,9 +63,8 @@ def unpacked(content, q, parameters, shared=None):
         As in `packed`, perhaps of another process.
     """
     function, rest = content
-    unpickler = pickle.Unpickler(io.BytesIO(rest))
-    known = dict(enumerate(q.from_function(function, parameters.symbols))) | {"q": q, **(shared or {})}
-    unpickler.persistent_load = known.__getitem__
+    unpickler = _Unpickler(io.BytesIO(rest))
+    unpickler.known = dict(enumerate(q.from_function(function, parameters.symbols))) | {"q": q, **(shared or {})}
     return unpickler.load()
 
 
@@ -88,6 +87,13 @@ class _Pickler(pickle.Pickler):
         if not is_dataclass(value) or isinstance(value, type):
             return NotImplemented
         return _made, (type(value), {f.name: getattr(value, f.name) for f in fields(value) if f.init and f.compare})
+
+
+class _Unpickler(pickle.Unpickler):
+    """Finds in `known` what a `_Pickler` referred to."""
+
+    def persistent_load(self, name):
+        return self.known[name]
 
 
 def _made(kind, values):

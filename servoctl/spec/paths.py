@@ -321,9 +321,9 @@ def _by_coefficients(t, times, points, degree, vanishing):
 
     A c = points, where A has a band: operations are in proportion to the number of points, not to its square.
     """
-    factors, shapes = _basis(times, degree, vanishing)
+    factors, parts, shapes = _basis(times, degree, vanishing)
     right = ca.vertcat(points, ca.SX(factors.shape[0] - len(times), points.shape[1]))
-    lower, upper = (ca.SX(ca.DM(part.sorted_indices())) for part in (factors.L, factors.U))
+    lower, upper = map(ca.SX, parts)
     c = ca.solve(upper, ca.solve(lower, right[np.argsort(factors.perm_r).tolist(), :]))[factors.perm_c.tolist(), :]
     inside, pieces = _inside(t, times).T, len(times) - 1
     local = [ca.mtimes(inside, c[r : r + pieces, :]) for r in range(degree + 1)]
@@ -331,9 +331,10 @@ def _by_coefficients(t, times, points, degree, vanishing):
 
 
 def _basis(times, degree, vanishing):
-    """The factors of A, and the basis on each piece in a time from -1 to 1 by powers, (degree + 1, n - 1, degree + 1).
+    """The factors of A by SciPy, their matrices (L, U), and the basis on each piece, (degree + 1, n - 1, degree + 1).
 
-    The rows of A give the points, and the derivatives at both ends that vanish.
+    The basis has powers of a time from -1 to 1. The rows of A give the points, and the derivatives at both ends that
+    vanish.
     """
     from scipy.interpolate import BSpline
     from scipy.sparse import csc_matrix
@@ -353,7 +354,7 @@ def _basis(times, degree, vanishing):
     for points in ((-1.0) ** np.arange(len(x)), x):
         c = factors.solve(np.append(points, np.zeros(len(ends))))
         _require_passing((shapes * c[own]).sum(axis=2, keepdims=True), points[:, None], half)
-    return factors, shapes
+    return factors, [ca.DM(csc_matrix(part).sorted_indices()) for part in (factors.L, factors.U)], shapes
 
 
 def _smooth_step(sigma, k):

@@ -231,7 +231,7 @@ def _wish(name, value):
 def _as_float(value):
     """A finite number, or NaN for anything else."""
     try:
-        number = np.nan if isinstance(value, (str, bytes, bool, np.bool)) else float(value)
+        number = np.nan if isinstance(value, (str, bytes, bool, np.bool_)) else float(value)
     except Exception:  # CasADi raises its own types for symbols
         number = np.nan
     return number if np.isfinite(number) else np.nan

@@ -72,7 +72,7 @@ class Study(Shown):
         """The rows that have these values, numbers or texts by the names of their columns."""
         keep = np.ones(len(self), dtype=bool)
         for name, value in values.items():
-            if not isinstance(value, str) and not is_number(value) and not isinstance(value, bool | np.bool):
+            if not isinstance(value, str) and not is_number(value) and not isinstance(value, bool | np.bool_):
                 rule = "A row has a number or a text."
                 raise SpecificationError(f"{name}={repr(value)[:150]} was given.", rule, name=name, value=value)
             keep &= self.column(name) == value
@@ -275,7 +275,7 @@ def _array(name, values):
 
 
 def _is_entry(value):
-    return value is None or isinstance(value, (bool, int, float, str, np.number, np.bool))
+    return value is None or isinstance(value, (bool, int, float, str, np.number, np.bool_))
 
 
 def _short(value):

@@ -121,7 +121,7 @@ def _required(model, run):
     whole_levels = jets is not None and len(jets) >= least and (len(jets) - least) % model.n == 0
     if t is None or knots is None or not whole_levels or jets.shape[1] != len(t):
         raise _malformed(least, model.n, times=np.shape(run.t), jets=np.shape(run.jets))
-    plain = isinstance(run.variants, tuple) and isinstance(run.success, bool | np.bool) and isinstance(run.method, str)
+    plain = isinstance(run.variants, tuple) and isinstance(run.success, bool | np.bool_) and isinstance(run.method, str)
     if not plain or not all(isinstance(mapping, Mapping) for mapping in mappings):
         raise _malformed(least, model.n, stored=[type(mapping).__name__ for mapping in mappings])
     good = np.isfinite(t) & np.all(np.isfinite(jets), axis=0)

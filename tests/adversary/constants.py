@@ -28,7 +28,7 @@ def main():
     parser.add_argument("--tests", nargs="+", required=True)
     parser.add_argument("--limit", type=float, default=600.0, help="seconds for a value")
     options = parser.parse_args()
-    text = (ROOT / "servoctl" / options.file).read_text()
+    text = (ROOT / "servoctl" / options.file).read_text(encoding="utf-8")
     for name in options.names:
         for factor in (10, 0.1):
             old, new = scaled(text, name, factor)

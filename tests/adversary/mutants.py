@@ -114,10 +114,10 @@ def outcome(file, old, new, tests, adversary, limit):
         copy = Path(folder) / "copy"
         shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", "__pycache__", ".venv", "*.npz", "figures.out"))
         path = copy / "servoctl" / file
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8")
         if text.count(old) != 1:
             return "NO PLACE"  # the package has changed: give the mutant another place
-        path.write_text(text.replace(old, new))
+        path.write_text(text.replace(old, new), encoding="utf-8")
         tests = ("adversary",) if adversary else tests
         command = ["-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *(f"tests/{test}" for test in tests)]
         environment = os.environ | {"PYTHONPATH": str(copy), "SERVOCTL_CACHE": f"{folder}/cache"}

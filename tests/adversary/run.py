@@ -37,7 +37,7 @@ def main():
     parser.add_argument("--case", type=Path, help="one saved case")
     options = parser.parse_args()
     if options.case:
-        saved = json.loads(options.case.read_text())
+        saved = json.loads(options.case.read_text(encoding="utf-8"))
         print(judge(from_text(json.dumps(saved["case"]))))
         return 0
     done = _logged(options.log)
@@ -51,14 +51,14 @@ def main():
         if verdict.wrong:
             options.out.mkdir(parents=True, exist_ok=True)
             content = {"seed": seed, "outcome": verdict.outcome, "detail": verdict.detail, "case": json.loads(case.as_text())}
-            (options.out / f"{seed}.json").write_text(json.dumps(content, indent=1))
+            (options.out / f"{seed}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     counts = table(done.values())
     return 1 if any(outcome.startswith("wrong") for outcome in counts) else 0
 
 
 def _logged(log):
     """The lines of a log by their seeds."""
-    lines = log.read_text().splitlines() if log and log.exists() else ()
+    lines = log.read_text(encoding="utf-8").splitlines() if log and log.exists() else ()
     return {line["seed"]: line for line in map(json.loads, lines)}
 
 
