@@ -84,7 +84,7 @@ def compiler():
     return None if command is None else " ".join(command)
 
 
-def described():
+def compiler_in_words():
     """The compiler in words: its command, version and flags; "none" without one."""
     import subprocess
 

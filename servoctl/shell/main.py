@@ -53,7 +53,7 @@ def main(argv=None):
 def _parser(argv):
     parser = argparse.ArgumentParser(
         prog="servoctl",
-        description="Inverse dynamics and motions of mechanisms under program constraints of any order.",
+        description="Inverse dynamics, simulation and control of machines under programs (servo constraints).",
         epilog="Examples: servoctl run overhead-crane;  servoctl run overhead-crane --set m_load=115;  "
         "servoctl report my_scene.py, a file that defines scene() -> (Mechanism, Program).",
     )

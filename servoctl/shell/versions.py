@@ -4,7 +4,7 @@ import platform
 from importlib.metadata import distributions
 
 from servoctl.codegen.cache import cache_directory
-from servoctl.codegen.compiler import described, processor
+from servoctl.codegen.compiler import compiler_in_words, processor
 from servoctl.version import __version__
 
 NEEDED = ("casadi", "numpy", "scipy", "control", "matplotlib", "tqdm")
@@ -21,6 +21,6 @@ def _versions(args):
     for name in (*NEEDED, *OPTIONAL):
         facts[name] = next((d.version for d in distributions(name=name)), "not found" if name in NEEDED else "")
     facts |= {"system": platform.platform(), "processor": processor()}
-    facts |= {"compiler": described(), "cache": cache_directory()}
+    facts |= {"compiler": compiler_in_words(), "cache": cache_directory()}
     print(*(f"{name:12}{fact}" for name, fact in facts.items() if fact), sep="\n")
     return 0
