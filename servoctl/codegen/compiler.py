@@ -214,7 +214,7 @@ def _without(reason):
     if not _warned:
         _warned = True
         warnings.warn(
-            f"{reason}. CasADi evaluates the models instead: the same results, simulations 10 to 100 times slower. "
+            f"{reason}. CasADi evaluates the models: the same results, repeated calls 10 to 1,000 times slower. "
             "Install gcc or clang, or name a compiler in CC.",
             RuntimeWarning,
             stacklevel=2,
