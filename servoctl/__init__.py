@@ -1,4 +1,4 @@
-"""servoctl: program (servo) constraints of any order become reduced dynamics, required actuation and a motion.
+"""servoctl: programs (servo constraints) of any order become the motion of a machine, its actuation, a controller.
 
 A specification flows one way: Mechanism and Program, by `derive`, become a Model; `simulate` makes it a Run;
 `verify` proves the run against the full mechanism.

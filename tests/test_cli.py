@@ -15,12 +15,15 @@ import pytest
 from conftest import words
 
 import servoctl
+from servoctl.codegen.cache import cache_directory
+from servoctl.codegen.compiler import compiler
 from servoctl.errors import IntegrationStopped
 from servoctl.gallery import gallery
 from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.shell.folder import FILES, LOOP_FILES
 from servoctl.shell.listing import COLUMNS_PRINTED, subjects
 from servoctl.shell.main import main
+from servoctl.shell.versions import NEEDED
 
 FALL = '''"""A mass in a plane follows a path in x, and falls."""
 import servoctl as sv
@@ -531,6 +534,30 @@ assert not slow, slow
     assert all(word in helped.stdout for word in ("list", "report", "run", "scene()"))
     version = process(sys.executable, "-m", "servoctl", "--version")
     assert version.stdout == f"servoctl {servoctl.__version__}\n"
+
+
+def test_versions_to_paste_into_a_report_of_a_fault():
+    """All that is needed is named, and neither NumPy nor CasADi has to work for it."""
+    script = """
+import sys
+from servoctl.shell.main import main
+sys.modules["numpy"] = sys.modules["casadi"] = None
+assert main(["versions"]) == 0
+"""
+    lines = process(sys.executable, "-c", script).stdout.splitlines()
+    told = {name: fact for name, _, fact in (re.split("( +)", line, maxsplit=1) for line in lines)}
+    assert told["servoctl"] == servoctl.__version__ and told["numpy"] == np.__version__
+    assert told[platform.python_implementation()] == platform.python_version()
+    assert told["cache"] == str(cache_directory()) and told["compiler"].split(":")[0] == (compiler() or "none")
+    project = (Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+    needed = re.search(r"^dependencies = \[(.*?)^\]", project, re.M | re.S)[1]
+    assert set(re.findall(r'^    "(\w+)', needed, re.M)) == set(NEEDED) <= set(told)
+
+
+def test_versions_without_a_compiler(capsys, monkeypatch):
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    assert main(["versions"]) == 0
+    assert re.search("^compiler +none$", capsys.readouterr().out, re.M)
 
 
 def test_a_terminal_without_greek_letters(here, fall, monkeypatch):

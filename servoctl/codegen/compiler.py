@@ -24,7 +24,6 @@ from pathlib import Path
 
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
-from servoctl.codegen.tables import bind
 from servoctl.progress import stage
 
 PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
@@ -60,6 +59,8 @@ def library(text, level="-O1", exact=False):
     ctypes.CDLL or None
         None without a compiler, or if compiling failed (one warning per process, unless none was chosen).
     """
+    from servoctl.codegen.tables import bind  # imports NumPy and CasADi, which naming the compiler needs not
+
     command, identity = _compiler()
     if command is None:
         return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
@@ -81,6 +82,16 @@ def compiler():
     """Command of the C compiler; None without one."""
     command, _ = _compiler()
     return None if command is None else " ".join(command)
+
+
+def compiler_in_words():
+    """The compiler in words: its command, version and flags; "none" without one."""
+    import subprocess
+
+    if (command := _compiler()[0]) is None:
+        return "none"
+    version = subprocess.getoutput(shlex.join((*command, "--version"))).partition("\n")[0]
+    return f"{' '.join(command)}: {version}, {' '.join((*FLAGS, *_optional_flags()))}"
 
 
 def _compiler():
@@ -118,6 +129,12 @@ def _processor():
             return "\n".join(line for line in first if line.startswith(identifying))
     except OSError:
         return ""
+
+
+def processor():
+    """The name of the processor's model, or what the system calls it."""
+    names = [line.partition(": ")[2] for line in _processor().splitlines() if line.startswith("model name")]
+    return "".join(names) or platform.processor() or platform.machine()
 
 
 @functools.cache
@@ -197,7 +214,7 @@ def _without(reason):
     if not _warned:
         _warned = True
         warnings.warn(
-            f"{reason}. CasADi evaluates the models instead: the same results, simulations 10 to 100 times slower. "
+            f"{reason}. CasADi evaluates the models: the same results, repeated calls 10 to 1,000 times slower. "
             "Install gcc or clang, or name a compiler in CC.",
             RuntimeWarning,
             stacklevel=2,

@@ -16,6 +16,7 @@ COMMANDS = {  # name: module, its function that adds the arguments, help
     "sweep": ("sweep", "add_sweep", "many cases of a scene, on several processes or machines, in one table"),
     "export-c": ("export", "add_export", "the feedforward and residuals of a scene as one C file and header"),
     "cache": ("cache", "add_cache", "where compiled code and derivations are kept on disk, and how much"),
+    "versions": ("versions", "add_versions", "versions, system and compiler, to paste into a report of a fault"),
 }
 
 
@@ -52,7 +53,7 @@ def main(argv=None):
 def _parser(argv):
     parser = argparse.ArgumentParser(
         prog="servoctl",
-        description="Inverse dynamics and motions of mechanisms under program constraints of any order.",
+        description="Inverse dynamics, simulation and control of machines under programs (servo constraints).",
         epilog="Examples: servoctl run overhead-crane;  servoctl run overhead-crane --set m_load=115;  "
         "servoctl report my_scene.py, a file that defines scene() -> (Mechanism, Program).",
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from servoctl import archive
 from servoctl.checks import as_numbers, is_number, mapping, named, require_kind, text
-from servoctl.codegen.compiler import compiler
+from servoctl.codegen.compiler import compiler, processor
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
 from servoctl.units import unit_of_column, with_unit
@@ -205,7 +205,7 @@ def _clipped(line):
 def machine():
     """The machine that computes: processor, cores, system, compiler and versions, as a dict of plain values."""
     return {
-        "processor": _processor(),
+        "processor": processor(),
         "cores": _cores(),
         "system": f"{platform.system()} {platform.machine()}",
         "compiler": compiler() or "none: loops are interpreted",
@@ -243,15 +243,6 @@ def _versions():
 
 
 _cores = functools.cache(os.cpu_count)
-
-
-@functools.cache
-def _processor():
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 def _array(name, values):
