@@ -42,13 +42,13 @@ def fitted(line, full=False):
     return next((text for text in texts if full or len(text) <= WIDTH), line(0))
 
 
-def listed(texts, room, unit=""):
+def listed(texts, room, apart=", ", unit=""):
     """Texts in a row, as many as there is room for, one at least; the others are counted."""
-    row, texts = ", ".join(texts) + unit, list(texts)
+    row, texts = apart.join(texts) + unit, list(texts)
     for shown in range(min(len(texts), WIDTH) - 1, 0, -1):
         if len(row) <= room:
             break
-        row = f"{', '.join(texts[:shown])}{unit} and {len(texts) - shown} more"
+        row = f"{apart.join(texts[:shown])}{unit} and {len(texts) - shown} more"
     return row
 
 

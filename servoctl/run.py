@@ -482,7 +482,7 @@ class Run(Sampled, Value):
         return "\n  ".join(filter(None, lines)).splitlines()
 
     def _happened(self, room):
-        times = {name: listed([f"{s:.7g}" for s in t], room, " s") for name, t in self.t_events.items() if len(t)}
+        times = {name: listed([f"{s:.7g}" for s in t], room, unit=" s") for name, t in self.t_events.items() if len(t)}
         return "events: " + "; ".join(f"{n} at t = {times[n]}" if n in times else f"{n} never" for n in self.events)
 
     def _computed(self, residuals):

@@ -406,7 +406,7 @@ def test_reports_are_short_and_serve_json(name, gallery_model):
     for motion in (None, scene_run(name, model)):
         report = sv.report(model, motion)
         lines = repr(report).splitlines()
-        assert 1 <= len(lines) <= 8 and max(map(len, lines)) <= 118
+        assert 1 <= len(lines) <= 8 and not any(line.endswith("...") for line in lines)
         assert json.loads(json.dumps(report.as_dict(), allow_nan=False)) == report.as_dict()
 
 

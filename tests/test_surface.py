@@ -169,20 +169,6 @@ def test_models_runs_and_verifications_print_in_eight_lines(name, gallery_model)
     assert short(model) and short(model.structure())
 
 
-def test_all_scenes_print_in_eight_lines(gallery_model):
-    """Models, reports, and runs of a few samples; their details hold what is printed, up to rounding and lists."""
-    offenders = {}
-    for name, scene in gallery.items():
-        model, (t0, _) = gallery_model(name).including([*scene.start, *scene.guess]), scene.t_span
-        start = model.start(t=t0, guess=scene.guess, **scene.start)
-        run = sv.simulate(model, start, (t0, t0 + 0.01), t_eval=np.linspace(t0, t0 + 0.01, 4))
-        for value in (model, run, sv.report(model)):
-            lines = repr(value).splitlines()
-            if len(lines) > MOST_IN_A_REPR or not value.details.startswith(lines[0].split(" and ")[0]):
-                offenders.setdefault(name, []).append(repr(value))
-    assert offenders == {}
-
-
 @pytest.fixture(scope="module")
 def large():
     """The plan of 24 masses, each with a motor, which stand still but for the first; its outputs are their places."""

@@ -157,15 +157,16 @@ class Report(Detailed):
         lines += [f"  {text}" for text in _of_residuals(self.residuals, full)]
         if self.basis.word != UNREALISABLE:
             index = "not defined" if self.index is None else self.index
-            lines.append(f"  index {index}; {self.realisation} realisation{_of_directions(self.directions)}")
+            directions = _of_directions(self.directions)
+            lines += f"  index {index}; {self.realisation} realisation{directions}".splitlines()
             free = f"{self.free} free initial value{'s' * (self.free != 1)}"
             free += "" if self.self_motion is None else f"; {self.self_motion}"
-            hidden = fitted(lambda room: f"hidden: {listed(self.hidden, room)}; {free}", full)
+            hidden = fitted(lambda room: f"hidden: {listed(self.hidden, room, apart='; ')}; {free}", full)
             lines.append(f"  {hidden}" if self.hidden else f"  no hidden constraint; {free}")
+        lines += [f"  {name}: {effort}" for name, effort in self.efforts.items()]
         if self.margin is not None:
             lines.append(f"  smallest pivot along the run {self.margin[0]:.2g} (t = {self.margin[1]:.4g} s)")
-        lines += [f"  {place}: {local.named(self.residuals)}" for place, local in self._differing()]
-        return [*lines, *(f"  {name}: {effort}" for name, effort in self.efforts.items())]
+        return [*lines, *(f"  {place}: {local.named(self.residuals)}" for place, local in self._differing())]
 
     def _differing(self):
         """The places whose ranks are printed: the first of those with the same ranks, none where all are the same."""
@@ -199,7 +200,7 @@ def _of_directions(found):
         which = "least cosine" if found.margin <= min(found.cosines) else "least cosine of the others"
         text += f" ({which} {found.margin:.2g})"
     if found.residuals:
-        text += f"; {', '.join(found.actuators) or 'no actuator'} without effect on {', '.join(found.residuals)}"
+        text += f"\n  {', '.join(found.actuators) or 'no actuator'} without effect on {', '.join(found.residuals)}"
     return text
 
 

@@ -24,7 +24,7 @@ from servoctl.model.equations import (
     monitored_rows,
     residual_rows,
 )
-from servoctl.model.report import described, warn_of_products
+from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
@@ -764,7 +764,7 @@ class Model(Detailed):
         return start.t, start.values
 
     def _lines(self, full):
-        return described(self, full)
+        return describe(self, full)
 
 
 def _samples(model, motion, jets):

@@ -13,7 +13,7 @@ from servoctl.reduction.self_motion import self_motion
 LARGEST_EXPLAINED = 20_000  # operations of the accelerations, beyond which relative degrees take minutes
 
 
-def described(model, full):
+def describe(model, full):
     """The lines of a printed model: what was done to the specification; if full, with what the derivation rests on."""
     r, rows = model.reduction, (_title, _left_out, _raised, _hidden, _free, _chosen, _switches)
     texts = [fitted(lambda room, row=row: row(model, r, room), full) for row in rows]
@@ -50,8 +50,9 @@ def _raised(model, r, room):
 
 def _hidden(model, r, room):
     stories = [row.story for row in r.hidden]
-    several = "s" * (len(stories) > 1)
-    return f"{len(stories)} hidden constraint{several} ({listed(stories, room)})" if stories else "no hidden constraint"
+    if not stories:
+        return "no hidden constraint"
+    return f"{len(stories)} hidden constraint{'s' * (len(stories) > 1)} ({listed(stories, room, apart='; ')})"
 
 
 def _free(model, r, room):
@@ -79,7 +80,7 @@ def _chosen(model, r, room):
 
 
 def _switches(model, r, room):
-    return f"paths switch at t = {listed([f'{t:g}' for t in model.knots], room, ' s')}" * bool(model.knots)
+    return f"paths switch at t = {listed([f'{t:g}' for t in model.knots], room, unit=' s')}" * bool(model.knots)
 
 
 def _derivation(r):
