@@ -537,7 +537,7 @@ assert not slow, slow
 
 def test_a_terminal_without_greek_letters(here, fall, monkeypatch):
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
-    assert "T from ker E?" in process(sys.executable, "-m", "servoctl", "report", fall).stdout
+    assert "T from ker E?" in process(sys.executable, "-m", "servoctl", "report", fall, "--verbose").stdout
 
 
 def test_a_reader_that_leaves_does_not_end_the_computation(here, fall):
