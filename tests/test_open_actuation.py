@@ -608,4 +608,4 @@ def test_wishes_with_unknown_symbols_are_refused():
 
 @pytest.mark.parametrize(("weights", "norm"), [(None, "norm"), ("inertia", "weighted norm"), ({"shoulder": 2.0}, "weighted norm")])
 def test_a_model_names_the_norm_that_is_least(weights, norm):
-    assert f": the actuation is of least {norm};" in repr(sv.derive(*arm(weights)))
+    assert f": of least {norm};" in repr(sv.derive(*arm(weights)))

@@ -76,7 +76,7 @@ def _chosen(model, r, room):
     norm = "of least weighted norm" if program.weights or program.metric == "inertia" else "of least norm"
     chosen = "nearest to the wishes" if program.toward else norm
     own = self_motion(r) or "no self-motion"
-    return f"{m} actuators for {k} residual{'s' * (k > 1)}: the actuation is {chosen}; {own}"
+    return f"{m} actuators for {k} residual{'s' * (k > 1)}: {chosen}; {own}"
 
 
 def _switches(model, r, room):
