@@ -28,7 +28,7 @@ def main(fast=False):
     """Extrema of both forces [N] and of the rope's angle [rad]; `fast` checks fewer segments of the plan."""
     mechanism, program = crane()
     model = sv.derive(mechanism, program)
-    print(model)  # X, Z differentiated 2x; 1 hidden constraint; 0 free initial values; margins
+    print(model)  # X, Z are differentiated twice; 1 hidden constraint; flat: nothing is integrated
     plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))  # the path holds its end after 6 s
     print(plan)
     proof = sv.verify(model, plan, segments=3 if fast else 20)

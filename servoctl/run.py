@@ -11,8 +11,8 @@ import numpy as np
 from servoctl import archive
 from servoctl.checks import finite, whole
 from servoctl.errors import SpecificationError, unknown
-from servoctl.markup import EXTREMA, Shown, digits
-from servoctl.model.start import State
+from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
+from servoctl.model.start import State, without_rounding
 from servoctl.model.switching import switching
 from servoctl.units import unit_of
 from servoctl.values import Value, frozen, read_only, same
@@ -44,7 +44,7 @@ class ByName:
         return name in self.names
 
 
-class Sampled(ByName, Shown):
+class Sampled(ByName, Detailed):
     """Signals by name at instants `t`, with the `units` of a mechanism, as tables."""
 
     def unit(self, name: str) -> str:
@@ -106,7 +106,7 @@ class Sampled(ByName, Shown):
         return archive.dataset(data, {"t": ("t", self.t, {"units": "s"})}, self._attributes())
 
 
-@frozen(eq=False)
+@frozen(eq=False, repr=False)
 class Run(Sampled, Value):
     """A motion with its actuation and its residuals; made by `simulate`, `close` or `load`.
 
@@ -442,49 +442,63 @@ class Run(Sampled, Value):
     def _attributes(self):
         return {"method": self.method, "drift": self.drift, "message": self.message, **self.counters}
 
-    def __repr__(self):
-        lines = self._facts()
-        for name, low, t_low, high, t_high, unit in self._extremes():
-            lines.append(f"  {name}: {low:.6g}{unit} (t = {t_low:.4g} s) .. {high:.6g}{unit} (t = {t_high:.4g} s)")
-        return "\n".join(lines)
+    def _lines(self, full):
+        return [*self._facts(full), *(range_in_words(*ends) for ends in self._extremes(full))]
 
     def _tables(self):
-        rows = [(name, *map(digits, numbers), unit.strip()) for name, *numbers, unit in self._extremes()]
-        return [(EXTREMA, rows)] if rows else [], self._facts()[1:]
+        rows = [(name, *map(digits, numbers), unit) for name, *numbers, unit in self._extremes(full=False)]
+        return [(EXTREMA, rows)] if rows else [], self._facts(full=False)[1:]
 
-    def _extremes(self):
-        """(name, least value, its t, greatest value, its t, unit) of the first actuators and outputs."""
-        signals = (*self.model.actuators, *self.model.outputs) if self.model is not None and len(self.t) else ()
-        for name in [name for name in signals if name in self.names and np.isfinite(self[name]).any()][:7]:
-            (t_low, low), (t_high, high) = self.extrema(name)
-            yield name, low, t_low, high, t_high, f" {self.unit(name)}".rstrip()
+    def _extremes(self, full):
+        """(name, least value, its t, greatest value, its t, unit) of each actuator and output.
 
-    def _facts(self):
+        Unless full, what is rounding beside the largest actuator or output is 0, at no t.
+        """
+        for group in (self.model.actuators, self.model.outputs) if self.model is not None and len(self.t) else ():
+            names = [name for name in group if name in self.names and np.isfinite(self[name]).any()]
+            ends = np.array([self.extrema(name) for name in names]).reshape(-1, 2, 2)[..., ::-1]
+            if not full:
+                ends[..., 0] = without_rounding(ends[..., 0])
+                ends[ends[..., 0] == 0.0, 1] = np.nan
+            for name, numbers in zip(names, ends.reshape(-1, 4), strict=True):
+                yield name, *numbers, self.unit(name)
+
+    def _facts(self, full):
         """Lines that say how the run was computed."""
         if not len(self.t):
             return [f"Run: no samples; {self.message}"]
+        outcome, _, note = self.message.partition("; ")
         worst = {name: float(np.abs(self.residual[name]).max(initial=0.0)) for name in self.residual}
-        shown = sorted(worst, key=worst.get, reverse=True)[:4]
+        residuals = [f"{worst[name]:.1e} ({name})" for name in sorted(worst, key=worst.get, reverse=True)]
+        method = f"method {self.method}" + (f", drift: {self.drift}" if self.drift else "")
         lines = [
-            f"Run: {len(self.t)} samples, t = {self.t[0]:g} .. {self.t[-1]:g} s; {self.message}",
-            f"  method {self.method}" + (f", drift: {self.drift}" if self.drift else ""),
-            "  " + ", ".join(f"{name} {count}" for name, count in self.counters.items() if count),
-            "  " + self.internal.get("text", ""),
-            "  events: " * bool(self.events)
-            + "; ".join(f"{name} {_times_in_words(t)}" for name, t in self.t_events.items()),
+            f"Run: {len(self.t)} samples, t = {self.t[0]:g} .. {self.t[-1]:g} s; {outcome}",
+            note,
+            method + (f"; largest residual {residuals[0]}" if residuals and not full else ""),
+            *(self._computed(residuals) if full else ()),
+            self.internal.get("text", ""),
+            fitted(self._happened, full) * bool(self.events),
         ]
-        if shown:
-            lines.append("  largest residuals over all levels: " + ", ".join(f"{n} {worst[n]:.1e}" for n in shown))
+        return "\n  ".join(filter(None, lines)).splitlines()
+
+    def _happened(self, room):
+        times = {name: listed([f"{s:.7g}" for s in t], room, unit=" s") for name, t in self.t_events.items() if len(t)}
+        return "events: " + "; ".join(f"{n} at t = {times[n]}" if n in times else f"{n} never" for n in self.events)
+
+    def _computed(self, residuals):
+        """The branch of a flat program's solution, what the method counted, and all residuals."""
         if self.start is not None and self.model is not None and self.model.flat:
-            q = (f"{name} = {self.start[name]:.4g}" for name in self.model.coordinate_names[:6])
-            lines.insert(2, f"  branch of {', '.join(q)} at t = {self.start.t:g} s")
-        return [line for line in lines if line.strip()]
+            q = (f"{name} = {self.start[name]:.4g}" for name in self.model.coordinate_names)
+            yield f"branch of {', '.join(q)} at t = {self.start.t:g} s"
+        yield ", ".join(f"{name} {count}" for name, count in self.counters.items() if count)
+        yield f"largest residuals over all levels: {', '.join(residuals)}" * bool(residuals)
 
 
-def _times_in_words(t):
-    """The first instants of an event in words."""
-    shown = ", ".join(f"{s:.7g}" for s in t[:4])
-    return f"at t = {shown} s" + (f" and {len(t) - 4} more" if len(t) > 4 else "") if len(t) else "never"
+def range_in_words(name, low, t_low, high, t_high, unit):
+    """The line of a signal from its least to its greatest value."""
+    low, high = (f"{digits(value)} {unit}".rstrip() for value in (low, high))
+    at_low, at_high = ("" if np.isnan(t) else f" (t = {t:.4g} s)" for t in (t_low, t_high))
+    return f"  {name}: {low} throughout" if low == high else f"  {name}: {low}{at_low} .. {high}{at_high}"
 
 
 def _split(name):

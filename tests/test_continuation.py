@@ -147,7 +147,7 @@ def test_the_start_repeats_the_branch():
     assert runs[0]["b"][0] > 0 > runs[1]["b"][0]
     for run in runs:
         assert sv.simulate(run.model, run.start, (0.0, 3.0)) == run
-        assert f"b = {run['b'][0]:.4g}" in repr(run)
+        assert f"b = {run['b'][0]:.4g}" in run.details
     late = moved("near", [2.9])  # without a sample at the start
     assert sv.simulate(late.model, late.start, (0.0, 3.0), t_eval=[2.9]) == late
 

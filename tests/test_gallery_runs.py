@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from readable import faults
 
 from servoctl.gallery import gallery
+from servoctl.markup import MOST_LINES
 from servoctl.shell.main import main
 
 ENDS_EARLY = ("appell-hamel-squared", "constant-speed-horizontal")  # at the singularities that their descriptions name
@@ -28,12 +29,19 @@ def drawn(monkeypatch):
 
 @pytest.mark.parametrize("name", gallery)
 def test_a_scene_runs_and_leaves_a_page_with_figures_that_can_be_read(name, drawn, tmp_path, capsys):
-    code = main(["run", name, "--out", str(tmp_path)])
-    assert code == (1 if name in ENDS_EARLY else 0), capsys.readouterr().out
+    """Each value prints itself in at most eight lines."""
+    code, out = main(["run", name, "--out", str(tmp_path)]), capsys.readouterr().out
+    assert code == (1 if name in ENDS_EARLY else 0), out
+    assert max(lines_of_values(out)) <= MOST_LINES and "rank margins" in (tmp_path / "report.txt").read_text(encoding="utf-8")
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["scene"]["name"] == name and (tmp_path / "index.html").stat().st_size < 2e6
     assert {"coordinates.png", "residuals.png", "motion.png"} <= set(drawn)
     assert not {figure: sentences for figure, sentences in drawn.items() if sentences}
+
+
+def lines_of_values(text):
+    """How many lines each printed value has, without those that continue a long one."""
+    return [sum(not line.startswith("    ") for line in value.splitlines()) for value in text.split("\n\n")]
 
 
 def figure_of(change):

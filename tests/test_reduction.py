@@ -148,7 +148,7 @@ def test_a_car_that_is_singular_up_to_rounding_is_level_and_its_margin_is_told(a
     model, level = derive(*mass_on_car(alpha=alpha)), derive(*mass_on_car(alpha=0.0))
     assert orders(model) == orders(level) and model.free == level.free == 1
     assert model.reduction.rank.dropped == pytest.approx(alpha**2, rel=0.02)
-    assert f"largest dropped {model.reduction.rank.dropped:.1e}" in repr(model)
+    assert f"largest dropped {model.reduction.rank.dropped:.1e}" in model.details
 
 
 # decimal factors -----------------------------------------------------------------------------------------------------

@@ -336,7 +336,7 @@ def test_a_plant_under_inputs_has_no_verdict():
     plant = sv.plant(crane()[0])
     run = sv.simulate(plant, {"x": 0.0, "theta": 0.1, "dx": 0.0, "dtheta": 0.0}, (0.0, 1.0), inputs={"F": 1.0})
     report = sv.report(run.model, run)
-    assert report.verdict == "inconclusive" and len(repr(report).splitlines()) <= 12
+    assert report.verdict == "inconclusive" and len(repr(report).splitlines()) <= 8
 
 
 @pytest.mark.parametrize("name", ["winch-crane", "crane-3d"])
@@ -407,7 +407,7 @@ def test_reports_are_short_and_serve_json(name, gallery_model):
     for motion in (None, scene_run(name, model)):
         report = sv.report(model, motion)
         lines = repr(report).splitlines()
-        assert 1 <= len(lines) <= 12 and max(map(len, lines)) <= 118
+        assert 1 <= len(lines) <= 8 and not any(line.endswith("...") for line in lines)
         assert json.loads(json.dumps(report.as_dict(), allow_nan=False)) == report.as_dict()
 
 

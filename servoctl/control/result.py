@@ -14,15 +14,16 @@ from servoctl.control.loop import Loop
 from servoctl.control.reference import resampled
 from servoctl.control.residuals import known_residuals
 from servoctl.errors import SpecificationError, unknown
-from servoctl.markup import digits
+from servoctl.markup import fitted, listed
+from servoctl.model.start import without_rounding
 from servoctl.plants.plant import Plant
-from servoctl.run import Run, Sampled
+from servoctl.run import Run, Sampled, range_in_words
 from servoctl.values import Value, frozen, read_only
 
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
 
-@frozen(eq=False)
+@frozen(eq=False, repr=False)
 class Closed(Sampled, Value):
     """The motion of a plant under a law; made by `close`.
 
@@ -304,54 +305,44 @@ class Closed(Sampled, Value):
                 ) from error
         return Closed, tuple(getattr(self, f.name) for f in fields(self))
 
-    def __repr__(self):
-        lines = self._facts()
-        if not len(self.t):
-            return "\n".join(lines)
-        for name, low, high, limited in self._exertion()[:5]:
-            unit = f" {self.unit(name)}".rstrip()
-            lines.append(f"  {name}: {low:.6g} .. {high:.6g}{unit}{f'; {limited}' if limited else ''}")
-        return "\n".join(lines[:12])
+    def _lines(self, full):
+        return [*self._facts(full), *self._exertion(full)] if len(self.t) else self._facts(full)
 
-    def _tables(self):
-        rows = [(n, digits(low), digits(high), self.unit(n), limited) for n, low, high, limited in self._exertion()]
-        return [(("input", "least", "greatest", "unit", ""), rows)], self._facts()[1:]
+    def _exertion(self, full):
+        """A line for each input: its range, and how long it is limited; rounding is 0 unless full."""
+        ends = np.array([(values.min(), values.max()) for values in self.input.values()])
+        ends, shares = ends if full else without_rounding(ends), [np.mean(a != NONE) for a in self.active.values()]
+        for name, (low, high), share in zip(self.input, ends, shares, strict=True):
+            limited = f"; limited during {100 * share:.3g} % of the samples" if share else ""
+            yield range_in_words(name, low, np.nan, high, np.nan, self.unit(name)) + limited
 
-    def _exertion(self):
-        """(name, least value, greatest value, how long it is limited) of each input."""
-        if not len(self.t):
-            return []
-        shares = {name: np.mean(active != NONE) for name, active in self.active.items()}
-        words = {name: f"limited during {100 * s:.3g} % of the samples" if s else "" for name, s in shares.items()}
-        return [(name, values.min(), values.max(), words[name]) for name, values in self.input.items()]
-
-    def _facts(self):
+    def _facts(self, full):
         """Lines that say what the loop was, and its errors."""
         loop = self.loop
+        steps = f"; {loop.substeps} integration step{'s' * (loop.substeps > 1)} per sample"
         lines = [
             f"Closed: {len(self.t)} samples at {1 / loop.period:g} Hz, t = {loop.t0:g} .. "
             f"{loop.t0 + max(len(self.t) - 1, 0) * loop.period:g} s; {self.message}",
-            f"  law: {self.law.name}; {loop.substeps} integration step{'s' * (loop.substeps > 1)} per sample",
-            *self._exposure(),
+            f"law: {self.law.name}" + steps * full,
+            fitted(self._exposure, full),
         ]
-        if not len(self.t):
-            return lines
-        sizes = {name: np.abs(values[0]) for name, values in self.residual.items()}
-        if sizes:
-            largest = sorted(sizes, key=lambda name: -sizes[name].max())[:3]
-            shown = "; ".join(f"{name} {sizes[name].max():.3g} / {sizes[name][-1]:.3g}" for name in largest)
-            lines.append(f"  max / final residual: {shown}")
-        program = self.plan.model.reduction.program.names if self.plan is not None and self.plan.model else ()
-        if left_out := [name for name in program if name not in sizes]:
-            lines.append(f"  not evaluated, as of order 3 or more: {', '.join(left_out)}"[:118])
-        if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
-            lines.append(f"  the plan ends at t = {self.plan.t[-1]:g} s; its last sample is held")
-        return lines
+        if len(self.t):
+            sizes = {name: np.abs(values[0]) for name, values in self.residual.items()}
+            order = sorted(sizes, key=lambda name: -sizes[name].max())
+            ends = [f"{name} {sizes[name].max():.3g} / {sizes[name][-1]:.3g}" for name in order]
+            lines.append("max / final residual: " * bool(ends) + "; ".join(ends if full else ends[:3]))
+            program = self.plan.model.reduction.program.names if self.plan is not None and self.plan.model else ()
+            left_out = [name for name in program if name not in sizes]
+            told = fitted(lambda room: f"not evaluated, as of order 3 or more: {listed(left_out, room)}", full)
+            lines.append(told * bool(left_out))
+            if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
+                lines.append(f"the plan ends at t = {self.plan.t[-1]:g} s; its last sample is held")
+        return "\n  ".join(filter(None, lines)).splitlines()
 
-    def _exposure(self):
-        """A line of noise, quantisation, disturbances and delay, where there are any."""
+    def _exposure(self, room):
+        """Noise, quantisation, disturbances and delay, where there are any."""
         c, delay = self.conditions, self.loop.delay
         kinds = (("noise on", c.sensors.noise), ("quantised:", c.sensors.quantisation), ("disturbed:", c.disturbance))
-        parts = [f"{what} {', '.join(names)}" for what, names in kinds if names]
+        parts = [f"{what} {listed(names, room)}" for what, names in kinds if names]
         parts += [f"delay of {delay} sample{'s' * (delay > 1)}"] * bool(delay)
-        return [f"  {'; '.join(parts)}"[:118]] * bool(parts)
+        return "; ".join(parts)

@@ -10,9 +10,8 @@ from servoctl.checks import interval, mapping
 from servoctl.errors import NotRealisable, SpecificationError, unknown
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
-from servoctl.markup import Shown
+from servoctl.markup import Detailed, fitted, listed
 from servoctl.model.model import SAMPLED, Model, derive
-from servoctl.model.report import WIDTH
 from servoctl.model.start import State
 from servoctl.reduction.self_motion import SelfMotion, self_motion
 from servoctl.reduction.structure import Directions, Local, directions, margins
@@ -22,7 +21,6 @@ from servoctl.spec.program import Program
 from servoctl.units import rate_unit
 from servoctl.values import frozen
 
-MOST_LINES = 12  # of a printed report
 FEWEST_OF_A_SPLINE = 4  # samples between two knots through which a spline of order 3 is laid
 
 
@@ -65,8 +63,8 @@ class Effort:
         return text
 
 
-@frozen(eq=False)
-class Report(Shown):
+@frozen(eq=False, repr=False)
+class Report(Detailed):
     """What a program asks of its mechanism, and which inverse it has; made by `report`.
 
     Attributes
@@ -153,25 +151,22 @@ class Report(Shown):
 
         return draw_report(self)
 
-    def __repr__(self):
+    def _lines(self, full):
         v, lines = self.basis, [f"Report: {self.basis.word}"]
         lines += [f"  {text}" for text in (v.reason, v.growth, v.do) if text]
-        lines += [f"  {text}" for text in _of_residuals(self.residuals)]
+        lines += [f"  {text}" for text in _of_residuals(self.residuals, full)]
         if self.basis.word != UNREALISABLE:
             index = "not defined" if self.index is None else self.index
-            lines.append(f"  index {index}; {self.realisation} realisation{_of_directions(self.directions)}")
-            hidden = f"hidden: {'; '.join(self.hidden)}" if self.hidden else "no hidden constraint"
-            lines.append(f"  {hidden}; {self.free} free initial value{'s' * (self.free != 1)}")
-            if self.self_motion is not None:
-                lines[-1] += f"; {self.self_motion}"
+            directions = _of_directions(self.directions)
+            lines += f"  index {index}; {self.realisation} realisation{directions}".splitlines()
+            free = f"{self.free} free initial value{'s' * (self.free != 1)}"
+            free += "" if self.self_motion is None else f"; {self.self_motion}"
+            hidden = fitted(lambda room: f"hidden: {listed(self.hidden, room, apart='; ')}; {free}", full)
+            lines.append(f"  {hidden}" if self.hidden else f"  no hidden constraint; {free}")
+        lines += [f"  {name}: {effort}" for name, effort in self.efforts.items()]
         if self.margin is not None:
             lines.append(f"  smallest pivot along the run {self.margin[0]:.2g} (t = {self.margin[1]:.4g} s)")
-        lines += [f"  {place}: {local.named(self.residuals)}" for place, local in self._differing()]
-        efforts = [f"  {name}: {effort}" for name, effort in self.efforts.items()]
-        room = MOST_LINES - len(lines)
-        if len(efforts) > room:
-            efforts = [*efforts[: room - 1], f"  and {len(efforts) - room + 1} more: report.efforts"]
-        return "\n".join(line if len(line) <= WIDTH else line[: WIDTH - 3] + "..." for line in [*lines, *efforts])
+        return [*lines, *(f"  {place}: {local.named(self.residuals)}" for place, local in self._differing())]
 
     def _differing(self):
         """The places whose ranks are printed: the first of those with the same ranks, none where all are the same."""
@@ -185,17 +180,16 @@ def _plain(value):
     return {name: None if isinstance(v, float) and not np.isfinite(v) else v for name, v in kept.items()}
 
 
-def _of_residuals(residuals):
-    """Lines on the residuals, those with equal facts together: at most two."""
+def _of_residuals(residuals, full):
+    """Lines on the residuals, one for those with equal facts."""
     groups = {}
     for name, facts in residuals.items():
         groups.setdefault(tuple(facts.values()), []).append(name)
-    texts = []
     for (order, raised, degree, smoothness), names in groups.items():
-        text = f"{', '.join(names)}: order {order}" + (f", raised {raised}x" if raised else "")
-        text += "" if degree is None else f", relative degree {degree}"
-        texts.append(text + ("" if smoothness is None else f", path C{smoothness}"))
-    return [*texts[:1], *(["; ".join(texts[1:])] if texts[1:] else [])]
+        facts = f"order {order}" + f", raised {raised}x" * bool(raised)
+        facts += "" if degree is None else f", relative degree {degree}"
+        facts += "" if smoothness is None else f", path C{smoothness}"
+        yield fitted(lambda room, names=names, facts=facts: f"{listed(names, room)}: {facts}", full)
 
 
 def _of_directions(found):
@@ -206,7 +200,7 @@ def _of_directions(found):
         which = "least cosine" if found.margin <= min(found.cosines) else "least cosine of the others"
         text += f" ({which} {found.margin:.2g})"
     if found.residuals:
-        text += f"; {', '.join(found.actuators) or 'no actuator'} without effect on {', '.join(found.residuals)}"
+        text += f"\n  {', '.join(found.actuators) or 'no actuator'} without effect on {', '.join(found.residuals)}"
     return text
 
 

@@ -556,7 +556,7 @@ class TaylorSteps(Stepping):
     def _go_on(self, variant, t, x):
         method = getattr(self.settings, "without_series", None)
         if method is not None:
-            raise Unsuited(f"pivots change at t = {t:.4g} s, and {self.method} would need other series", method)
+            raise Unsuited(f"at t = {t:.4g} s the equations change their form, and {self.method} its series", method)
         super()._go_on(variant, t, x)
 
     def _believed(self, log, span):

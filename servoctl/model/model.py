@@ -13,7 +13,7 @@ from servoctl.codegen.function import Compiled, compiled
 from servoctl.errors import ServoError, SingularProgram, SpecificationError, unknown
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
-from servoctl.markup import Shown
+from servoctl.markup import Detailed
 from servoctl.model import saddle
 from servoctl.model.equations import (
     EQUATIONS,
@@ -110,7 +110,7 @@ def _derived(*specification):
     return Model(store.reduction(reduce), store)
 
 
-class Model(Shown):
+class Model(Detailed):
     """Reduced dynamics and required actuation of a program; made by `derive`.
 
     Functions are derived, or read from disk, at their first use. A model is a value: models of the same specification
@@ -763,8 +763,8 @@ class Model(Shown):
             return None
         return start.t, start.values
 
-    def __repr__(self):
-        return describe(self)
+    def _lines(self, full):
+        return describe(self, full)
 
 
 def _samples(model, motion, jets):

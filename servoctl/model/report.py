@@ -5,92 +5,92 @@ import warnings
 import numpy as np
 
 from servoctl.errors import ServoError, SingularProgram
+from servoctl.markup import fitted, listed
 from servoctl.model.rest import first_motion, standstill_near
 from servoctl.reduction.rows import alternatives
 from servoctl.reduction.self_motion import self_motion
 
 LARGEST_EXPLAINED = 20_000  # operations of the accelerations, beyond which relative degrees take minutes
-WIDTH = 118
 
 
-def describe(model):
-    """What `print(model)` shows: how the specification was reduced, in at most twelve lines."""
-    r = model.reduction
-    program = f"program {', '.join(r.program.residuals)} by {_by(r)}" if r.program.residuals else "no program"
-    raised = _raised(r)
-    lines = [
-        f"Model: {' '.join(r.mechanism.q.names)}; {program}",
-        *_left_out(model),
-        *([f"  {raised}"] if raised else []),
-        *_hidden_and_free(model),
-        f"  {_rule(r)}",
-        *_open(r),
-    ]
-    if any(not row.affine for row in r.rows):
-        nonlinear = ", ".join(row.name for row in r.rows if not row.affine)
-        lines.append(f"  {nonlinear}: not linear in the highest derivative, differentiated once more")
-    lines.append(f"  rank margins: smallest pivot {r.rank.kept:.1e}, largest dropped {r.rank.dropped:.1e}")
-    if model.knots:
-        lines.append(f"  paths switch at t = {', '.join(f'{k:g}' for k in model.knots[:8])} s")
-    return "\n".join(line if len(line) <= WIDTH else line[: WIDTH - 3] + "..." for line in lines)
+def describe(model, full):
+    """The lines of a printed model: what was done to the specification; if full, with what the derivation rests on."""
+    r, rows = model.reduction, (_title, _left_out, _raised, _hidden, _free, _chosen, _switches)
+    texts = [fitted(lambda room, row=row: row(model, r, room), full) for row in rows]
+    return "\n  ".join(filter(None, [*texts, *(_derivation(r) if full else ())])).splitlines()
 
 
-def _left_out(model):
+def _title(model, r, room):
+    names, program, actuators = listed(r.mechanism.q.names, room), r.program, r.mechanism.actuators
+    if not program.residuals:
+        return f"Model: {names}; no program"
+    several = "s" * (len(actuators) != 1)
+    by = "an ideal reaction" if program.by == "ideal" else f"the actuator{several} {listed(actuators, room)}"
+    return f"Model: {names} under the program {listed(program.residuals, room)}; realised by {by}"
+
+
+def _left_out(model, r, room):
     """How many coordinates play no part in the program."""
     names = model.left_out
-    count = f"{len(names)} coordinates play" if len(names) > 1 else f"The coordinate {''.join(names)} plays"
-    return [f"  {count} no part in this program: left out; keep= includes them"] if names else []
+    count = f"{len(names)} coordinates play" if len(names) > 1 else f"the coordinate {''.join(names)} plays"
+    return f"{count} no part in the program: left out, unless keep= includes them" * bool(names)
 
 
-def _by(r):
-    return "an ideal reaction" if r.program.by == "ideal" else f"actuators {', '.join(r.mechanism.actuators)}"
-
-
-def _raised(r):
-    """'X, Z (order 0) differentiated 2x each': until the accelerations appear."""
-    groups = {}
+def _raised(model, r, room):
+    """How often each residual and material constraint is differentiated, until the accelerations appear."""
+    groups, times = {}, {0: "not differentiated", 1: "differentiated once", 2: "differentiated twice"}
     for name, row in r.original.items():
         groups.setdefault((max(0, r.top - row.order), row.order), []).append(name)
-    parts = []
-    for (count, order), names in groups.items():
-        times = f"differentiated {count}x" + (" each" if len(names) > 1 else "") if count else "not differentiated"
-        parts.append(f"{', '.join(names)} (order {order}) {times}")
-    return "; ".join(parts)
+    return "; ".join(
+        f"{listed(names, room)} (order {order}) {'are' if len(names) > 1 else 'is'} "
+        f"{times.get(k, f'differentiated {k} times')}"
+        for (k, order), names in groups.items()
+    )
 
 
-def _hidden_and_free(model):
-    """Hidden constraints and free initial values, on one line if there is room."""
-    r = model.reduction
-    free = f"{model.free} free initial value{'s' * (model.free != 1)}"
-    free += " (flat: nothing is integrated)" if model.flat else ""
-    if not r.hidden:
-        return [f"  no hidden constraint; {free}"]
-    count = f"{len(r.hidden)} hidden constraint{'s' * (len(r.hidden) != 1)}"
-    stories = "; ".join(row.story for row in r.hidden)
-    line = f"  {count} ({stories}); {free}"
-    return [line] if len(line) <= WIDTH else [f"  {count}; {free}", f"    {stories}"]
+def _hidden(model, r, room):
+    stories = [row.story for row in r.hidden]
+    if not stories:
+        return "no hidden constraint"
+    return f"{len(stories)} hidden constraint{'s' * (len(stories) > 1)} ({listed(stories, room, apart='; ')})"
 
 
-def _rule(r):
-    names = r.mechanism.q.force_names
-    dependent = ", ".join(names[i] for i in r.realisation.dependent) or "none"
-    if r.program.by == "actuators":
-        return f"(3.18) with T from ker Eᵀ; dependent: {dependent}; no rule for the reaction is assumed"
-    program = [row for row in r.original.values() if row.kind == "program"]
-    classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in program)
-    rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
-    return f"(3.18) with T from ker G; dependent: {dependent}; under {rule}"
+def _free(model, r, room):
+    """What the program leaves free."""
+    if model.flat:
+        return "flat: the program determines the whole motion, nothing is integrated"
+    rest = "the internal dynamics are" if r.program.residuals else "the motion is"
+    return f"{model.free} free initial value{'s' * (model.free > 1)}: {rest} integrated"
 
 
-def _open(r):
-    """How actuation that the program leaves open is chosen, and the self-motion that goes with it."""
-    m, k = len(r.mechanism.actuators), len(r.program.residuals)
-    if r.program.by == "ideal" or not 0 < k < m:
-        return []
-    weighted = r.program.weights or r.program.metric == "inertia"
-    norm = "of least weighted norm" if weighted else "of least norm"
-    chosen = "nearest to the wishes" if r.program.toward else norm
-    return [f"  {m} actuators for {k} residuals: {chosen}; {self_motion(r) or 'no self-motion'}"]
+def _chosen(model, r, room):
+    """The rule for an ideal reaction; or how actuation that the program leaves open is chosen, with its self-motion."""
+    m, k, program = len(r.mechanism.actuators), len(r.program.residuals), r.program
+    if program.by == "ideal":
+        rows = [row for row in r.original.values() if row.kind == "program"]
+        classical = all(row.order == 0 or (row.order == 1 and row.affine) for row in rows)
+        rule = "d'Alembert's principle" if classical else "the generalised Chetaev rule, a postulate at this order"
+        return f"the reaction obeys {rule}"
+    if not 0 < k < m:
+        return ""
+    norm = "of least weighted norm" if program.weights or program.metric == "inertia" else "of least norm"
+    chosen = "nearest to the wishes" if program.toward else norm
+    own = self_motion(r) or "no self-motion"
+    return f"{m} actuators for {k} residual{'s' * (k > 1)}: {chosen}; {own}"
+
+
+def _switches(model, r, room):
+    return f"paths switch at t = {listed([f'{t:g}' for t in model.knots], room, unit=' s')}" * bool(model.knots)
+
+
+def _derivation(r):
+    """How eq. (3.18) was applied, rows that are not linear, and the margins of the rank."""
+    dependent = ", ".join(r.mechanism.q.force_names[i] for i in r.realisation.dependent) or "none"
+    kernel, rule = ("Eᵀ", "; no rule for the reaction is assumed") if r.program.by == "actuators" else ("G", "")
+    yield f"(3.18) with T from ker {kernel}; dependent: {dependent}{rule}"
+    if nonlinear := [row.name for row in r.rows if not row.affine]:
+        yield f"{', '.join(nonlinear)}: not linear in the highest derivative, differentiated once more"
+    yield f"rank margins: smallest pivot {r.rank.kept:.1e}, largest dropped {r.rank.dropped:.1e}"
 
 
 def warn_of_products(r):

@@ -71,7 +71,8 @@ class State(Value, Shown):
         return float(self.values[self.names.index(name)])
 
     def __repr__(self):
-        items = [f"{name} = {value:.6g}" for name, value in zip(self.names, self._without_rounding(), strict=True)]
+        shown = np.where(np.isin(self.names, self.held), self.values, without_rounding(self.values))
+        items = [f"{name} = {value:.6g}" for name, value in zip(self.names, shown, strict=True)]
         shown = ", ".join(items[:12]) + (f", ... ({len(items)} in all)" if len(items) > 12 else "")
         held, free, rest = (", ".join(names) or "nothing" for names in (self.held, self.free, self.at_rest))
         return (
@@ -82,20 +83,20 @@ class State(Value, Shown):
             + self._told_apart()
         )
 
-    def _without_rounding(self):
-        """The values, with zeros for those that Newton's method leaves as rounding of the largest, (n_x,)."""
-        size = np.abs(self.values)
-        shown = np.isin(self.names, self.held) | (size > PRINTED_ZERO * size.max(initial=0.0))
-        return np.where(shown, self.values, 0.0)
-
     def _told_apart(self):
         """The line of a printed state on its branches: the first values in which they differ."""
         if len(self.branches) < 2:
             return ""
         spread = np.ptp(self.branches, axis=0) > DISTINCT * (1.0 + np.abs(self.values))
-        shown = np.flatnonzero(spread)[:SHOWN]
-        each = [", ".join(f"{self.names[i]} = {branch[i]:.4g}" for i in shown) for branch in self.branches]
+        shown, branches = np.flatnonzero(spread)[:SHOWN], map(without_rounding, self.branches)
+        each = [", ".join(f"{self.names[i]} = {branch[i]:.4g}" for i in shown) for branch in branches]
         return f"\n  {len(each)} branches: {each[0]} (this one); {'; '.join(each[1:])}; a guess chooses"
+
+
+def without_rounding(values):
+    """Values (...), with zeros for those that are rounding beside the largest of them."""
+    size = np.abs(values)
+    return np.where(size > PRINTED_ZERO * size.max(initial=0.0), values, 0.0)
 
 
 class JetEquations:

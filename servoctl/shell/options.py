@@ -8,6 +8,7 @@ from servoctl.errors import SpecificationError
 from servoctl.methods.choice import METHODS
 
 MOST_SAMPLES = 10**7  # of a run: some gigabytes
+VERBOSE = {"action": "store_true", "help": "print the details of values, which report.txt has"}
 METHODS_HELP = f"{', '.join(METHODS)}; default: by the model"
 SCENE_HELP = "a gallery name, or a .py file that defines scene()"
 MANY = {"nargs": "+", "action": "extend", "default": []}  # options that take several values, and may be repeated

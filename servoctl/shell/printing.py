@@ -8,17 +8,17 @@ COLUMNS = 120  # width of printed lines
 
 
 class Report:
-    """Prints values, and keeps what it printed in `text`."""
+    """Prints values, with their details if `verbose`, and keeps these in `text`."""
 
-    def __init__(self):
-        self.text = ""
+    def __init__(self, verbose=False):
+        self.text, self.verbose = "", verbose
 
     def say(self, value):
         """Print a value, with long lines wrapped."""
-        text = "\n".join(_wrapped(line, "    ") for line in str(value).splitlines()) + "\n"
-        self.text = f"{self.text}\n{text}" if self.text else text
+        details = getattr(value, "details", value)
+        self.text += "\n" * bool(self.text) + _wrapped(details, "    ") + "\n"
         try:
-            print(text, flush=True)
+            print(_wrapped(details if self.verbose else value, "    ") + "\n", flush=True)
         except BrokenPipeError:  # a reader that stops reading, such as head, does not stop the computation
             sys.stdout = open(os.devnull, "w")
 
@@ -29,7 +29,6 @@ def complain(*texts):
         print(_wrapped(text, "  "), file=sys.stderr)
 
 
-def _wrapped(line, indent):
-    if len(line) <= COLUMNS:
-        return line
-    return textwrap.fill(line, COLUMNS, subsequent_indent=indent, break_on_hyphens=False)
+def _wrapped(value, indent):
+    wide = textwrap.TextWrapper(COLUMNS, subsequent_indent=indent, break_on_hyphens=False)
+    return "\n".join(line if len(line) <= COLUMNS else wide.fill(line) for line in str(value).splitlines())

@@ -6,6 +6,7 @@ from pathlib import Path
 import servoctl as sv
 from servoctl.errors import NotRealisable, ServoError
 from servoctl.gallery import gallery
+from servoctl.shell.options import VERBOSE
 from servoctl.shell.printing import Report
 from servoctl.shell.scenes import find_scene
 
@@ -13,6 +14,7 @@ from servoctl.shell.scenes import find_scene
 def add_report(report):
     """Add the arguments of the command."""
     report.add_argument("scene", metavar="NAME_OR_FILE", help="a gallery name, a .py file, or the folder of a run")
+    report.add_argument("--verbose", **VERBOSE)
     report.set_defaults(command=_report)
 
 
@@ -20,7 +22,7 @@ def _report(args):
     if args.scene not in gallery and os.path.isdir(args.scene):
         print(_earlier_report(Path(args.scene)), end="")
         return 0
-    report = Report()
+    report = Report(args.verbose)
     _, scene = find_scene(args.scene)
     mechanism, program = scene.build()
     report.say(mechanism)

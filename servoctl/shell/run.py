@@ -16,7 +16,7 @@ from servoctl.progress import stage
 from servoctl.shell import loop
 from servoctl.shell.folder import ANIMATION, FILES, LOOP_FILES, folder_of, jsonable, summary
 from servoctl.shell.motion import described
-from servoctl.shell.options import METHODS_HELP, add_motion, drift, samples, used
+from servoctl.shell.options import METHODS_HELP, VERBOSE, add_motion, drift, samples, used
 from servoctl.shell.page import write_page
 from servoctl.shell.printing import Report, complain
 from servoctl.shell.scenes import find_scene
@@ -38,6 +38,7 @@ def add_run(run):
     run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
     run.add_argument("--no-figures", action="store_true", help="leave out the figures")
+    run.add_argument("--verbose", **VERBOSE)
     run.add_argument("--animate", action="store_true", help=f"write the motion to a file, too: {ANIMATION}")
     loop.add_loop(run)
     run.set_defaults(command=_run)
@@ -51,7 +52,7 @@ def _run(args):
 
 def _compute(args, name, scene, folder):
     """Derive, simulate, save, verify, close the loop and draw, in this order; returns the exit code."""
-    report = Report()
+    report = Report(args.verbose)
     as_drift(args.drift)  # refuse unknown names before anything is derived
     if args.method is not None:
         as_method(args.method)

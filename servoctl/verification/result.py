@@ -4,11 +4,10 @@ from dataclasses import field
 
 import numpy as np
 
-from servoctl.markup import Shown, digits
+from servoctl.markup import Detailed, digits
 from servoctl.values import frozen
 
 PASSED, FAILED, INCONCLUSIVE = "passed", "failed", "inconclusive"
-MOST_LINES = 12  # of a printed verification
 CHECK = ("check, relative", "value", "limit", "", "")
 WORDS = {
     "samples": "samples that are not finite or out of order",
@@ -17,7 +16,7 @@ WORDS = {
     "segments": "states after the motion was integrated from each sample to the next",
     "power": "power balance dE/dt = sum of force times velocity",
     "energy": "energy against the integrated power",
-    "multiplier form": "(3.18) against the form with multipliers",
+    "multiplier form": "residual of the equations with Lagrange multipliers",
     "higher jets": "jets above the order of the model",
     "switches": "states beyond the switches of their sides",
     "outside": "part of the ideal reaction outside the actuators' reach",
@@ -27,7 +26,7 @@ WORDS = {
     "loop limits": "inputs beyond their limits",
     "loop repeated": "all signals of the loop when it is run again",
 }
-RESIDUAL = "largest residual at any level"
+RESIDUAL = "largest residual, derivatives included"
 
 
 def within(value, limit):
@@ -35,8 +34,8 @@ def within(value, limit):
     return "" if limit is None else "within" if value <= limit else "beyond"
 
 
-@frozen
-class Verification(Shown):
+@frozen(repr=False)
+class Verification(Detailed):
     """Errors of a run against the full mechanism, all of them relative.
 
     Attributes
@@ -89,20 +88,19 @@ class Verification(Shown):
             for limit in [self.limits.get(name)]
         ]
 
-    def __repr__(self):
+    def _lines(self, full):
         residuals = {k: v for k, v in self.numbers.items() if k.startswith("residual ")}
         worst = max(residuals, key=lambda key: np.nan_to_num(residuals[key], nan=np.inf), default=None)
         said = {FAILED: f"FAILED: {', '.join(self.failures)}"}.get(self.verdict, self.verdict)
-        lines = [f"Verification: {said}", *(f"  {doubt}" for doubt in self.doubts)]
-        lines += [self._line(key, WORDS[key]) for key in WORDS if key in self.numbers]
-        if worst:
-            lines.append(self._line(worst, f"{RESIDUAL} ({worst.removeprefix('residual ')})"))
-        lines += [f"  {note}" for note in self.notes]
-        return "\n".join(lines[:MOST_LINES])
+        checks = [key for key in WORDS if key in self.numbers] + [key for key in residuals if full or key == worst]
+        checks.sort(key=lambda key: key not in self.failures)  # what failed comes first
+        first = [f"  {text}" for text in (*self.doubts, *self.notes)]
+        return [f"Verification: {said}", *first, *map(self._line, checks)]
 
-    def _line(self, key, words):
+    def _line(self, key):
         limit = self.limits.get(key, np.inf)
         allowed = f"limit {limit:7.1e}" if np.isfinite(limit) else "no limit     "
+        words = WORDS.get(key) or f"{RESIDUAL} ({key.removeprefix('residual ')})"
         return f"  {self.numbers[key]:7.1e}, {allowed}: {words}{'  FAILED' * (key in self.failures)}"
 
 
