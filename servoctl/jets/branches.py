@@ -56,12 +56,7 @@ class Switch(NamedTuple):
 
 
 def has_switches(expressions):
-    """Whether expressions hold an operation with branches.
-
-    Parameters
-    ----------
-    expressions : SX column
-    """
+    """Whether an SX column of expressions holds an operation with branches."""
     f, last = ca.Function("branches", [], [expressions], {"allow_free": True, "live_variables": False}), set()
     places = 0
     for k in range(f.n_instructions()):
@@ -84,12 +79,8 @@ def contains(f, *operations):
 class Branches:
     """Smooth expressions in place of ones with branches that depend on some of their symbols.
 
-    Parameters
-    ----------
-    moves : callable
-        Whether branches may change along a motion that changes a symbol (SX).
-    taken : sequence of str
-        Names that branches must not have.
+    `moves` says of a symbol whether branches may change along a motion that changes it; `taken` are names that branches
+    must not have.
     """
 
     def __init__(self, moves, taken=()):
@@ -97,18 +88,7 @@ class Branches:
         self.moves, self.switches, self._angles, self._functions = moves, [], {}, []
 
     def smooth(self, expressions, angles=False):
-        """The expressions with branches as parameters.
-
-        Parameters
-        ----------
-        expressions : sequence of SX scalars
-        angles : bool
-            Whether atan2 is a continuous angle; otherwise it stays as it is.
-
-        Returns
-        -------
-        list of SX scalars
-        """
+        """SX scalars with branches as parameters; atan2 stays as it is, or is a continuous angle if `angles`."""
         if not expressions:
             return []
         merged = ca.densify(cse(ca.vertcat(*expressions)))
@@ -184,16 +164,8 @@ def without_turns(expression):
     """An expression that is a sum with angles atan2(y, x), zero also where it differs from zero by whole turns.
 
     φ = c (θ_1 + k_2 θ_2 + ...) + r with whole k_j is c times the angle of the vector e^(i r/c) z_1 z_2^(k_2) ..., where
-    z = x + i y. Written as that angle, φ has the same derivatives, and jumps only opposite to its zeros.
-
-    Parameters
-    ----------
-    expression : SX scalar
-
-    Returns
-    -------
-    SX scalar
-        The expression itself if it is no such sum.
+    z = x + i y. Written as that angle, φ has the same derivatives, and jumps only opposite to its zeros. An expression
+    that is no such sum is returned as it is.
     """
     if not contains(ca.Function("angles", [], [expression], {"allow_free": True}), ca.OP_ATAN2):
         return expression
@@ -240,17 +212,7 @@ _EDGES = {
 
 
 def domain_edges(expressions):
-    """Where functions in expressions cease to be smooth.
-
-    Parameters
-    ----------
-    expressions : sequence of SX scalars
-
-    Returns
-    -------
-    list of (str, SX, float)
-        What happens there in words, an argument, and its value at the edge of the domain.
-    """
+    """Where functions in expressions cease to be smooth: in words, an argument (SX), and its value at the edge."""
     work, result = [], []
 
     def value(op, operands):
@@ -278,18 +240,8 @@ _STEEP = {
 def steep_arguments(expressions, squares=True):
     """The arguments near whose zeros, or least magnitudes, functions in expressions may change much in a short time.
 
-    A bump exp(-(k z)²), a blend tanh(k z) or a pole 1/(z² + a²) is narrow about z = 0.
-
-    Parameters
-    ----------
-    expressions : sequence of SX scalars
-    squares : bool
-        Whether squares and whole powers count, which are narrow inside other functions alone.
-
-    Returns
-    -------
-    list of SX scalars
-        Each once.
+    A bump exp(-(k z)²), a blend tanh(k z) or a pole 1/(z² + a²) is narrow about z = 0. Squares and whole powers, which
+    are narrow inside other functions alone, count if `squares`. Each argument is returned once.
     """
     work, result = [], {}
 
@@ -322,16 +274,7 @@ _SIZES = {
 
 
 def size_of_terms(expression):
-    """The sum of the magnitudes of an expression's terms, multiplied out.
-
-    Parameters
-    ----------
-    expression : SX scalar
-
-    Returns
-    -------
-    SX scalar
-    """
+    """The sum of the magnitudes of an expression's terms, multiplied out."""
     return sizes_of_terms([expression])[0]
 
 
@@ -371,16 +314,7 @@ def cse(expression):
 
 
 def as_text(f):
-    """Text of an SX function, which is equal for equal functions alone.
-
-    Parameters
-    ----------
-    f : casadi.Function
-
-    Returns
-    -------
-    str
-    """
+    """Text of an SX function, which is equal for equal functions alone."""
     if not made or not contains(f, ca.OP_CALL):
         return f.serialize()
     outputs = f.call(f.sx_in())
