@@ -1,5 +1,6 @@
 """Settings of Sphinx: `python -m sphinx -W -b html docs site` builds the documentation, without a network."""
 
+import inspect
 import json
 import re
 from base64 import b64decode
@@ -9,18 +10,22 @@ from shutil import rmtree
 import servoctl
 
 project, author, version = "servoctl", "servoctl contributors", servoctl.__version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 html_theme, html_title, html_copy_source = "furo", "servoctl", False
-html_show_copyright = False
+html_show_copyright, html_math_renderer = False, "mathml"
 html_static_path, html_css_files = ["static"], ["site.css"]
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 autodoc_default_options = {"members": True, "member-order": "bysource"}
-autodoc_typehints = "none"  # docstrings have them, with shapes and units
+autodoc_typehints = "signature"  # docstrings add shapes and units
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 88  # characters: longer ones have a line for each parameter
 napoleon_google_docstring = napoleon_use_rtype = False
 default_role = "py:obj"
 suppress_warnings = ["ref.python"]  # a shape such as (n,) is taken for a name, and several classes have an n
 HERE = Path(__file__).parent
+SOURCES = [*HERE.glob("*.md"), *HERE.parent.glob("examples/*.py"), *HERE.parent.glob("notebooks/*.ipynb")]
+USED = "\n".join(path.read_text(encoding="utf-8") for path in SOURCES if path.stem not in ("architecture", "numbers"))
 CODE = r"(::\n\n(?:    .*\n|\n)+)"
 
 
@@ -36,6 +41,30 @@ def sections(app, what, name, thing, options, lines):
     parts = re.split(CODE, text)
     parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]
     lines[:] = "".join(parts).split("\n")
+
+
+def internal(app, what, name, thing, skip, options):
+    """Leave out what a module imports, and a class's methods without types that no page and no example names."""
+    function = getattr(thing, "fget", None) or getattr(thing, "func", thing)
+    if what == "module" and options.imported_members:
+        home = inspect.getmodule(thing)
+        public = any(home is getattr(servoctl, name) for name in servoctl.__all__)
+        return None if public and "----" in (thing.__doc__ or "") else True
+    if skip or what != "class" or not inspect.isfunction(function):
+        return None
+    owner = getattr(servoctl, function.__qualname__.split(".")[0], None)
+    known = re.search(rf"\.{name}\b", USED) or f"`{name}`" in (owner.__doc__ or "")
+    return None if function.__annotations__ or known else True
+
+
+def signed(app, what, name, thing, options, signature, returns):
+    """No constructor for a class whose values a function makes; the short name of what NumPy takes for an array."""
+    from numpy.typing import ArrayLike
+    from sphinx.util.typing import stringify_annotation
+
+    if what == "class" and "made by" in (thing.__doc__ or "").split("\n\n")[0]:
+        return "", None
+    return (signature or "").replace(stringify_annotation(ArrayLike, "smart"), "ArrayLike") or None, returns
 
 
 def outside(app, docname, source):
@@ -70,8 +99,25 @@ def notebooks(app):
         (folder / f"{notebook.stem}.md").write_text(as_page(notebook, folder), encoding="utf-8")
 
 
+def formula(writer, node):
+    r"""A formula as MathML, which browsers typeset without a script; its \tag stands at the right."""
+    from docutils.nodes import SkipNode
+    from latex2mathml.converter import convert
+
+    block = node.tagname == "math_block"
+    text, *tag = re.split(r"\\tag\{(.*?)\}", node.astext())
+    shown = convert(text.replace("'", "′"), display="block" if block else "inline")  # no prime of a prime
+    shown = re.sub(r"<mi>([a-z]{3,})</mi>", r'<mo form="prefix" lspace="0.17em" rspace="0.17em">\1</mo>', shown)
+    number = f'<span class="eqno">({tag[0]})</span>' if tag else ""
+    writer.body.append(f'<div class="formula">{shown}{number}</div>' if block else shown)
+    raise SkipNode
+
+
 def setup(app):
     """Connect these functions to Sphinx, that of docstrings before napoleon's."""
+    app.add_html_math_renderer("mathml", (formula, None), (formula, None))
     app.connect("builder-inited", notebooks)
     app.connect("autodoc-process-docstring", sections, priority=1)
+    app.connect("autodoc-process-signature", signed)
+    app.connect("autodoc-skip-member", internal)
     app.connect("source-read", outside)

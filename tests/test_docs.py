@@ -34,7 +34,8 @@ def contents(page):
 
 def test_every_block_is_executed_or_printed_by_a_test():
     """Python by test_readme, C by test_export_c and test_export_law, other processes by test_sweep, other tools below, commands by .ci/run."""
-    elsewhere = {"c_export.md": {"c", "cpp"}, "sweeps.md": {"py"}, "ten_lines.md": {"py", "modelica"}, "README.md": {"sh"}}
+    elsewhere = {"c_export.md": {"c", "cpp"}, "sweeps.md": {"py"}, "ten_lines.md": {"py", "modelica"}}
+    elsewhere |= dict.fromkeys(("README.md", "index.md"), {"sh"})
     for page in [ROOT / "README.md", *DOCS.glob("*.md")]:
         kinds = set(re.findall(r"^```(\w+)", page.read_text(encoding="utf-8"), re.M))
         assert kinds - elsewhere.get(page.name, set()) <= {"python", "text"}, page.name
