@@ -13,11 +13,8 @@ from servoctl.errors import ServoError
 from servoctl.shell.printing import complain
 from servoctl.study.table import machine
 
-FILES = (
-    "index.html", "run.npz", "summary.json", "report.txt", "motion.png", "path.png", "coordinates.png", "actuation.png",
-    "residuals.png",
-)  # fmt: skip
-LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
+FILES = ("index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt", "motion.png", "sheet.png")
+FIGURES = ("path.png", "coordinates.png", "actuation.png", "residuals.png", "closed_loop.png")  # by --all-figures
 ANIMATION = "motion.gif"
 
 
@@ -67,7 +64,7 @@ class Folder:
         """
         try:
             if not self._actions:
-                for name in (*FILES, *LOOP_FILES, ANIMATION):
+                for name in (*FILES, *FIGURES, ANIMATION):
                     (self.path / name).unlink(missing_ok=True)
             action(self.path)
         except (OSError, ServoError) as error:

@@ -13,11 +13,8 @@ VERSIONS = ("", "version")
 PICTURES = {  # file: what it shows
     "motion.png": "The mechanism at instants from the start (light) to the end (dark), over the programmed path;"
     " side by side where it turns in place.",
-    "path.png": "The path.",
-    "coordinates.png": "Coordinates.",
-    "actuation.png": "Required actuation, with its extrema.",
-    "closed_loop.png": "The closed loop.",
-    "residuals.png": "Residuals of the constraints and their derivatives.",
+    "sheet.png": "Coordinates, required actuation with its extrema, residuals of the constraints and their derivatives,"
+    " and the closed loop.",
 }
 STYLE = """
 body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
