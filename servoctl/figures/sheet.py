@@ -30,5 +30,7 @@ def draw_sheet(run, loop, title):
             ax.set_title(f"plan: {extrema_text(run, name, units)}", fontsize="small", loc="left")
     for ax in axes[:-1]:
         ax.set_xlabel("")
+    for line in (line for ax in axes for line in ax.get_lines() if len(line.get_xdata()) == 1):
+        line.set_marker("o")  # of a run of one sample
     axes[0].figure.suptitle(title)
     return axes[0].figure

@@ -12,9 +12,10 @@ SOURCE = "matplotlib.pyplot.subplots()"
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 MORE = ("#8C6D31", "#7F7F7F", "#5E3C99", "#882255", "#44AA99", "#B5BD00", "#FF7F9F")  # for more curves
+INSTANTS = 6  # intervals of a time axis, at most
 STYLES = ("-", "--", ":", "-.")
 FIGURE_WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
-PANEL, ENTRY = 1.7, 0.22  # inches: height of a panel, of an entry of its legend
+PANEL, ENTRY = 1.5, 0.22  # inches: height of a panel, of an entry of its legend
 LEFT, BELOW, LABEL, LINE, PAD = 1.0, 0.5, 0.75, 0.2, 0.08  # inches: ticks and labels, from label to axis, a title, a gap
 BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False}  # a legend to the right of its panel
 
@@ -69,7 +70,9 @@ def _title_lines(ax):
 def panels(heights, **options):
     """Axes one above the other with heights [inches] and one time axis, in a new figure."""
     height = sum(heights) + (PAD + LINE) * (len(heights) + 1) + BELOW
-    return figure(height, rows=len(heights), sharex=True, height_ratios=heights, **options)[1][:, 0]
+    axes = figure(height, rows=len(heights), sharex=True, height_ratios=heights, **options)[1][:, 0]
+    axes[0].locator_params("x", nbins=INSTANTS)  # of all: making its ticks takes most of the time of a panel
+    return axes
 
 
 def high(entries):
@@ -93,10 +96,10 @@ def as_single_axes(ax, height, **options):
 
 
 def write_png(drawn, path):
-    """Write a figure to a file, laid out and drawn once; `savefig` does both twice."""
+    """Write a figure to a file, laid out and drawn once; `savefig` does both twice, and packs more tightly."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    FigureCanvasAgg(drawn).print_png(path)
+    FigureCanvasAgg(drawn).print_png(path, pil_kwargs={"compress_level": 1})
 
 
 def logarithmic(ax):

@@ -38,7 +38,7 @@ class Folder:
             raise ServoError(
                 f"The folder {str(path).encode(errors='backslashreplace').decode()} cannot be written: {reason}.",
                 f"Numbers and figures of a run are written to a folder, by default {Path('servoctl-runs', name)}.",
-                do="Give another folder by --out. Nothing has been computed yet.",
+                do=f"Give another one: --out {Path(tempfile.gettempdir(), name)}. Nothing has been computed yet.",
                 folder=str(path),
             ) from error
 
@@ -130,7 +130,6 @@ def summary(run, start, verification):
             "residual": start.residual,
         },
         "structure": _structure(model),
-        "operations": model.operations(),
         "extrema": {n: _extrema(run, n) for n in dict.fromkeys([*sv.figures.efforts(run), *model.outputs])},
         "residuals": {name: {"worst": _worst(levels), "levels": levels} for name, levels in residuals.items()},
         "verification": verified,
