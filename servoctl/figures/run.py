@@ -323,6 +323,7 @@ def _frame(ax, run, names, largest):
 
 
 def extrema_text(run, name, units):
+    """The least and the greatest value of a signal, with their instants."""
     if not np.all(np.isfinite(run[name])):
         return f"{name}: not finite at some instants"
     unit = unit_of(name, units)

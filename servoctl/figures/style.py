@@ -16,7 +16,8 @@ INSTANTS = 6  # intervals of a time axis, at most
 STYLES = ("-", "--", ":", "-.")
 FIGURE_WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
 PANEL, ENTRY = 1.5, 0.22  # inches: height of a panel, of an entry of its legend
-LEFT, BELOW, LABEL, LINE, PAD = 1.0, 0.5, 0.75, 0.2, 0.08  # inches: ticks and labels, from label to axis, a title, a gap
+LEFT, BELOW, LABEL = 1.0, 0.5, 0.75  # inches: for ticks and labels beside and below a panel, from its label to the axis
+LINE, PAD = 0.2, 0.08  # inches: a line of a title, a gap
 BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False}  # a legend to the right of its panel
 
 
