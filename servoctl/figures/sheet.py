@@ -15,7 +15,7 @@ def draw_sheet(run, loop, title):
     groups, levels = by_unit(coordinates(run), units), max(map(len, run.residual.values()), default=0)
     forces = [name for name in efforts(run) if not (kept and name in loop.plant.inputs)]
     heights = [*(high(len(group)) for group in groups), *(high(1) for _ in forces)]
-    heights += [high(len(run.residual) + levels)] * bool(levels)
+    heights += [max(2.0, high(len(run.residual) + levels))] * bool(levels)  # its label is long
     axes = panels(heights + ([] if loop is None else heights_of_loop(loop, units)))
     of_run, of_loop = axes[: len(heights)], axes[len(heights) :]
     over_time(run, groups, of_run[: len(groups)], units)

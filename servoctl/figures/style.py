@@ -16,7 +16,7 @@ INSTANTS = 6  # intervals of a time axis, at most
 STYLES = ("-", "--", ":", "-.")
 FIGURE_WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
 PANEL, ENTRY = 1.5, 0.22  # inches: height of a panel, of an entry of its legend
-LEFT, BELOW, LABEL = 1.0, 0.5, 0.75  # inches: for ticks and labels beside and below a panel, from its label to the axis
+LEFT, BELOW, LABEL = 1.1, 0.5, 0.85  # inches: for ticks and labels beside and below a panel, from its label to the axis
 LINE, PAD = 0.2, 0.08  # inches: a line of a title, a gap
 BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False}  # a legend to the right of its panel
 
@@ -47,7 +47,8 @@ def column():
             renderer, (width, height) = fig._get_renderer(), fig.get_size_inches()
             legends = [ax.get_legend() for ax in fig.axes if ax.get_legend()]
             beside = [legend.get_window_extent(renderer).x1 - legend.axes.bbox.x1 for legend in legends]
-            across = width - LEFT - PAD - max([PAD, *(part / fig.dpi for part in beside)])
+            left = LEFT if any(ax.axison for ax in fig.axes) else 2 * PAD
+            across = width - left - PAD - max([PAD, *(part / fig.dpi for part in beside)])
             titles = [text for text in fig.texts if text.get_text() and text.get_text() == fig.get_suptitle()]
             top = height - sum(PAD + text.get_window_extent(renderer).height / fig.dpi for text in titles)
             for text in titles:
@@ -56,7 +57,7 @@ def column():
             shares = np.array(fig.axes[0].get_gridspec().get_height_ratios(), dtype=float)
             up = shares / shares.sum() * (top - above.sum() - BELOW)
             for ax, low, tall in zip(fig.axes, top - np.cumsum(above + up), up, strict=True):
-                ax.set_position([LEFT / width, low / height, across / width, tall / height])
+                ax.set_position([left / width, low / height, across / width, tall / height])
                 ax.set_in_layout(True)  # which `set_position` ends
                 if ax.get_aspect() == "auto":
                     ax.yaxis.set_label_coords(-LABEL / across, 0.5)
