@@ -86,8 +86,8 @@ def unknown(name, valid, what):
     nearest = _next_derivative(str(name), valid) or (by_lower_case[matches[0]] if matches else None)
     return NameUnknown(
         f"No {what} is named {name!r}",
-        f"The names are: {', '.join(valid)}" if valid else f"There is no {what} at all",
-        repr(nearest) if nearest else "",
+        nearest=repr(nearest) if nearest else "",
+        do=f"The names are: {', '.join(valid)}" if valid else f"There is no {what} at all",
         name=name,
         valid=valid,
         match=nearest,

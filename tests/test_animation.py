@@ -185,8 +185,9 @@ def test_height_is_what_weight_acts_along(rest, signs):
 
 
 def test_an_animation_shows_the_motion(crane):
-    shown = sv.plots.animate(crane, fps=40)
-    assert (len(shown.t), shown.pace, shown.space) == (41, 1.0, False)
+    shown = sv.plots.animate(crane, fps=20)
+    assert (len(shown.t), shown.pace, shown.space) == (41, 0.5, False)  # a second, shown in two
+    assert "slowed down 2 times" in repr(shown)
     assert shown.shapes["load"] == pytest.approx(np.array([crane["X"], -crane["Z"]]), abs=1e-9)
     assert shown.shapes["rope"][:, 0] == pytest.approx(np.array([crane["x"], 0 * crane["x"]]), abs=1e-9)
     assert shown.trails["load"] is not shown.shapes["load"] and list(shown.trails) == ["load"]
@@ -194,12 +195,12 @@ def test_an_animation_shows_the_motion(crane):
     assert height == pytest.approx(-4 + 2 * X / 5, abs=1e-9)
     assert list(sv.plots.animate(crane, trail=["trolley", "load"]).trails) == ["trolley", "load"]
     assert sv.plots.animate(crane, trail=()).programmed == {}
-    middle = sv.plots.animate(crane, fps=40, trail="trolley").trails["trolley"]
+    middle = sv.plots.animate(crane, fps=20, trail="trolley").trails["trolley"]
     assert middle == pytest.approx(np.array([crane["x"], 0 * crane["x"]]), abs=1e-9)  # of a body
 
 
 def test_the_path_of_a_loop_lies_over_that_of_its_plan(crane, loop):
-    shown = sv.plots.animate(loop, fps=50)
+    shown = sv.plots.animate(loop, fps=25)
     assert shown.trails["load"] == pytest.approx(np.array([loop["X"], -loop["Z"]]), abs=1e-9)
     X, height = shown.programmed["load"]
     assert height == pytest.approx(-4 + 2 * X / 5, abs=1e-6)
@@ -210,9 +211,9 @@ def test_a_file_has_the_frames_and_the_load_rises(crane, tmp_path):
     path = sv.plots.animate(crane, fps=10).save(tmp_path / "crane")
     assert path.name == "crane.gif"
     picture = Image.open(path)
-    assert (picture.n_frames, picture.info["loop"], picture.info["duration"]) == (11, 0, 100)
+    assert (picture.n_frames, picture.info["loop"], picture.info["duration"]) == (21, 0, 100)
     lines = []
-    for frame in (0, 10):
+    for frame in (0, 20):
         picture.seek(frame)
         red, _, blue = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), -1, 0)
         lines.append(np.nonzero(red - blue > 120)[0].min())
@@ -259,14 +260,14 @@ def points_of(text):
 
 
 def test_a_page_moves_the_lines_by_its_script(crane, tmp_path):
-    shown = sv.plots.animate(crane, fps=20)
+    shown = sv.plots.animate(crane, fps=10)
     page = shown.save(tmp_path / "crane.html").read_text(encoding="utf-8")
     assert not re.search("href|https?://|src=", page)
     drawing = ET.fromstring(re.search("<svg.*?</svg>", page, re.S)[0])
     bar = points_of(drawing.findall("polyline")[-1].get("points"))
     scale = (bar[1] - bar[0])[0] / float(drawing.find("text").text.split()[0])  # units of the drawing in a metre
     clock, button, frame, moving, (trail,) = drawn_by_its_script(page, 15)
-    assert (clock, button, frame) == ("t = 0.75 s", "Play", 15)
+    assert (clock, button, frame) == ("t = 0.75 s, slowed down 2 times", "Play", 15)
     load, start = points_of(moving[-1]["points"]), points_of(drawing.findall("polyline")[-2].get("points"))
     assert np.array_equal(load[0], load[1])  # a dot, drawn last
     moved_by = [crane["X"][30] - crane["X"][0], crane["Z"][30] - crane["Z"][0]]  # Z points down, as the drawing's y
@@ -296,7 +297,7 @@ def test_bodies_lie_below_lines_and_lines_below_dots_in_a_page(name, gallery_mod
 
 
 def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):
-    shown = sv.plots.animate(crane, fps=2)
+    shown = sv.plots.animate(crane, fps=1)
     monkeypatch.setenv("PATH", str(tmp_path))
     with refused(ServoError, "ffmpeg"):
         shown.save(tmp_path / "crane.mp4")
@@ -306,7 +307,7 @@ def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):
     raw = shown.save(tmp_path / "crane.mp4").read_bytes()
     words = (tmp_path / "crane.mp4.txt").read_text(encoding="utf-8").split()
     width, height = map(int, words[words.index("-s") + 1].split("x"))
-    assert width % 2 == height % 2 == 0 and len(raw) == 3 * width * height * 3 and words[words.index("-r") + 1] == "2"
+    assert width % 2 == height % 2 == 0 and len(raw) == 3 * width * height * 3 and words[words.index("-r") + 1] == "1"
     program.write_text("#!/bin/sh\necho broken codec >&2\nexit 1\n", encoding="utf-8")
     with refused(ServoError, "broken codec"):
         shown.save(tmp_path / "crane.mp4")

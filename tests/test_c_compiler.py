@@ -76,6 +76,20 @@ def test_what_an_integration_uses_is_compiled_at_its_first_use(fresh, use):
     assert len(fresh) == 1
 
 
+def test_a_command_compiles_what_it_calls_often_and_reads_what_is_there(fresh, monkeypatch):
+    model, other, x, p = pendulum_with_loops(), pendulum_with_loops(), np.zeros(2), np.ones(1)
+    with compiler.once(100):
+        few = [model.rk(0.0, x + 0.1, 0.01, 12, p, RK4)[1] for _ in range(2)]  # four evaluations a step
+        assert not fresh and model.backend == "casadi"
+        model.rk(0.0, x, 0.01, 12, p, RK4)
+        assert len(fresh) == 1 and model.backend == "c"
+        new_process(monkeypatch)
+        other.rk(0.0, x, 0.01, 1, p, RK4)
+        assert len(fresh) == 1 and other.backend == "c"
+    np.testing.assert_array_equal(few[0], few[1])
+    np.testing.assert_allclose(few[0], model.rk(0.0, x + 0.1, 0.01, 12, p, RK4)[1], rtol=1e-12)
+
+
 def test_a_call_has_the_same_bits_whatever_was_called_before(fresh, monkeypatch):
     rng = np.random.default_rng(4)
     x, t = rng.normal(size=(2, 300)), np.linspace(0.0, 1.0, 300)

@@ -20,7 +20,7 @@ from servoctl.codegen.compiler import compiler
 from servoctl.errors import IntegrationStopped
 from servoctl.gallery import gallery
 from servoctl.methods.choice import METHODS as ALL_METHODS
-from servoctl.shell.folder import FILES, LOOP_FILES
+from servoctl.shell.folder import FIGURES, FILES
 from servoctl.shell.listing import COLUMNS_PRINTED, subjects
 from servoctl.shell.main import main
 from servoctl.shell.versions import NEEDED
@@ -71,8 +71,9 @@ def summary(folder):
 def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert main(["run", "overhead-crane"]) == 0
     folder = here / "servoctl-runs" / "overhead-crane"
-    assert {f.name for f in folder.iterdir()} == {*FILES, *LOOP_FILES} - {"path.png"}
+    assert {f.name for f in folder.iterdir()} == set(FILES)
     printed = capsys.readouterr().out
+    assert printed.splitlines()[-1] == f"open {folder.relative_to(here) / 'index.html'}"
     report = (folder / "report.txt").read_text(encoding="utf-8")
     assert all(word in text for text in (printed, report) for word in ("Model: x, l, theta", "State at t = 0 s", "Run: ", "Verification: passed"))
     run = servoctl.load(folder / "run.npz")
@@ -98,7 +99,7 @@ def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert set(facts["versions"]) == {"servoctl", "casadi", "numpy", "scipy", "python"}
 
     page = (folder / "index.html").read_text(encoding="utf-8")
-    pictures = ["motion.png", "coordinates.png", "actuation.png", "closed_loop.png", "residuals.png"]
+    pictures = ["motion.png", "sheet.png"]
     assert re.findall('alt="([^"]+)" src="data:image/png;base64,', page) == pictures  # all inside, nothing elsewhere
     assert page.count("src=") == len(pictures) and not re.search("href|https?://|url\\(", page)
     assert len(page) < LARGEST_PAGE
@@ -184,7 +185,7 @@ def test_a_motion_that_stops_is_kept_drawn_and_explained(here, capsys):
     assert "SingularProgram: The program is singular at t = 0.698" in words(out) and "'speed'" in out
     assert "Verification: left out" in out
     assert "ended early, at t = 0.698" in err
-    assert {f.name for f in (here / "squared").iterdir()} == set(FILES) - {"path.png"}
+    assert {f.name for f in (here / "squared").iterdir()} == set(FILES) - {"closed_loop.npz"}
     run = servoctl.load(here / "squared" / "run.npz")
     assert not run.success and 0.69 < run.t[-1] < 0.7
     assert summary(here / "squared")["status"] == -1
@@ -202,13 +203,22 @@ def test_the_page_shows_the_motion(here, fall):
     assert not (folder / "motion.gif").exists() and not re.search("<img|<svg", (folder / "index.html").read_text(encoding="utf-8"))
 
 
+def test_each_figure_has_a_file_of_its_own_where_that_is_wanted(here, fall):
+    (here / "servoctl-runs" / "fall").mkdir(parents=True)
+    assert main(["run", fall, "--no-verify", "--all-figures", "--samples", "11"]) == 0
+    names = {f.name for f in (here / "servoctl-runs" / "fall").iterdir()}
+    assert names >= {"sheet.png", "path.png", "coordinates.png", "residuals.png"} and names - {*FILES} <= {*FIGURES}
+    assert main(["run", fall, "--no-verify", "--no-figures", "--samples", "11"]) == 0
+    assert not {*FIGURES, "sheet.png"} & {f.name for f in (here / "servoctl-runs" / "fall").iterdir()}
+
+
 def test_a_mechanism_that_cannot_be_drawn_has_a_page_without_it(here, capsys):
     text = FALL.replace("x y", "a b").replace('"y"', '"b"')
     (here / "turn.py").write_text(text.replace('"dy"', '"db"').replace('"x": "m", "b": "m"', '"a": "rad"'), encoding="utf-8")
     assert main(["run", "turn.py", "--animate", "--no-verify", "--no-loop"]) == 0
     assert "There is no animation" in capsys.readouterr().err
     names = {f.name for f in (here / "servoctl-runs" / "turn").iterdir()}
-    assert names.isdisjoint({"motion.gif", "motion.png", "path.png"}) and "index.html" in names
+    assert names.isdisjoint({"motion.gif", "motion.png"}) and "index.html" in names
 
 
 # --- a user's file
@@ -301,6 +311,7 @@ def test_faults_in_a_users_file(here, capsys, text, facts):
         ("run fall.py --method Euler", ["No method is named 'Euler'"]),
         ("run fall.py --step 0.1", ["step=0.1"]),
         ("run fall.py --t-span 1 1", ["(1.0, 1.0)"]),
+        ("run fall.py --t-span 1 0", ["--t-span 1 0 runs backwards", "Nearest: --t-span 0 1"]),
     ],
 )
 def test_errors_are_told_without_a_traceback(here, fall, capsys, arguments, facts):
@@ -322,14 +333,17 @@ def test_errors_are_told_without_a_traceback(here, fall, capsys, arguments, fact
         ("run --hold y=1 fall.py", "the scene's name comes before such options"),
         ("run fall.py --drift much", "'much' is not none, project, minimal or a time constant"),
         ("run fall.py --samples 1", "'1' is not a whole number of at least 2"),
-        ("walk", "invalid choice: 'walk'"),
+        ("run fall.py --t-spam 0 1", "unrecognized argument '--t-spam'; nearest: --t-span."),
+        ("run fall.py --no-figures --all-figures", "not allowed with"),
+        ("runn fall.py", "No command is named 'runn'. Nearest: 'run'"),
         ("", "required: command"),
     ],
 )
 def test_arguments_that_cannot_be_read(capsys, arguments, fact):
     with pytest.raises(SystemExit) as stop:
         main(arguments.split())
-    assert stop.value.code == 2 and fact in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert stop.value.code == 2 and fact in err and len(err.splitlines()) == 1
 
 
 # --- the folder

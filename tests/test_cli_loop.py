@@ -93,10 +93,10 @@ def test_an_ideal_reaction_has_no_loop(here, capsys, options, code):
 def test_the_loop_is_left_out_and_files_of_an_earlier_one_go(here, capsys):
     line = "run overhead-crane --no-verify --out crane"
     assert main(line.split()) == 0
-    assert (here / "crane" / "closed_loop.png").exists()
+    assert (here / "crane" / "closed_loop.npz").exists()
     assert "Closed" in capsys.readouterr().out
     assert main([*line.split(), "--no-loop"]) == 0
-    assert {f.name for f in (here / "crane").iterdir()} == set(FILES) - {"path.png"}
+    assert {f.name for f in (here / "crane").iterdir()} == set(FILES) - {"closed_loop.npz"}
     assert "Closed" not in capsys.readouterr().out
 
 
@@ -113,7 +113,7 @@ def test_a_loop_that_is_lost_is_kept_to_its_last_finite_sample(here, capsys):
     facts = json.loads((here / "crane" / "summary.json").read_text(encoding="utf-8"))["closed_loop"]
     run = sv.load(here / "crane" / "closed_loop.npz")
     assert not facts["success"] and facts["t_end"] == run.t[-1] < 4.0 and not run.success
-    assert np.isfinite(run.jets).all() and (here / "crane" / "closed_loop.png").exists()
+    assert np.isfinite(run.jets).all() and (here / "crane" / "sheet.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def test_a_scene_runs_and_leaves_a_page_with_figures_that_can_be_read(name, draw
     assert max(lines_of_values(out)) <= MOST_LINES and "rank margins" in (tmp_path / "report.txt").read_text(encoding="utf-8")
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["scene"]["name"] == name and (tmp_path / "index.html").stat().st_size < 2e6
-    assert {"coordinates.png", "residuals.png", "motion.png"} <= set(drawn)
+    assert set(drawn) == {"motion.png", "sheet.png"}
     assert not {figure: sentences for figure, sentences in drawn.items() if sentences}
 
 

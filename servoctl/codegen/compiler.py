@@ -11,9 +11,12 @@ which rounds once instead of twice.
 """
 
 import atexit
+import contextlib
+import contextvars
 import ctypes
 import functools
 import hashlib
+import math
 import os
 import platform
 import shlex
@@ -35,13 +38,29 @@ _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
 _locks = {}  # key -> lock: no two threads compile the same text
 _guard = threading.Lock()
 _warned = False
+_repaid = contextvars.ContextVar("calls that repay compiling", default=0)
 
 
 class _CompilerFailed(Exception):
     """The compiler refused the text."""
 
 
-def library(text, level="-O1", exact=False):
+@contextlib.contextmanager
+def once(calls):
+    """Compile a library that is not on disk only if so many calls of its functions are known: in commands that end."""
+    token = _repaid.set(calls)
+    try:
+        yield
+    finally:
+        _repaid.reset(token)
+
+
+def repaid(calls):
+    """Whether so many calls are worth compiling."""
+    return calls >= _repaid.get()
+
+
+def library(text, level="-O1", exact=False, calls=math.inf):
     """Load the library of a C translation unit; compile it where it is neither loaded nor on disk.
 
     Parameters
@@ -53,17 +72,20 @@ def library(text, level="-O1", exact=False):
         gcc. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
     exact : bool
         Whether the results are those of the operations one by one, without contraction.
+    calls : float
+        Calls of its functions that are known, of which `once` may ask for more.
 
     Returns
     -------
     ctypes.CDLL or None
-        None without a compiler, or if compiling failed (one warning per process, unless none was chosen).
+        None without a compiler, if compiling failed (one warning per process, unless none was chosen), or not yet.
     """
     from servoctl.codegen.tables import bind  # imports NumPy and CasADi, which naming the compiler needs not
 
     command, identity = _compiler()
     if command is None:
-        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _without("No C compiler was found")
+        chosen = os.environ.get("SERVOCTL_COMPILER") == "none" or not repaid(calls)
+        return None if chosen else _without("No C compiler was found")
     level, *tuning = level.split()
     flags = (level, *FLAGS, *(ROUNDED if exact else ())), (*_optional_flags(), *tuning)
     parts = (text, digest(), *flags[0], *flags[1], identity, platform.machine(), _processor())
@@ -72,7 +94,10 @@ def library(text, level="-O1", exact=False):
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            _loaded[key] = _open(cache_directory() / f"{key}.so") or _build(text, flags, f"{key}.so", command)
+            found = _open(cache_directory() / f"{key}.so")
+            if found is None and not repaid(calls):
+                return None
+            _loaded[key] = found or _build(text, flags, f"{key}.so", command)
             if _loaded[key] is not None:
                 bind(_loaded[key], text)
         return _loaded[key]

@@ -8,13 +8,13 @@ of a function that is called often are compiled too, with CasADi's operations on
 
 import functools
 import itertools
-import os
+import math
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.interpreted import Interpreter, restored, restored_grid, weighted
+from servoctl.codegen.interpreted import BLOCK, Interpreter, restored, restored_grid, weighted
 from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library, builtin
 from servoctl.codegen.tables import BOUND
@@ -154,7 +154,7 @@ class Compiled:
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
         self._interpreter = Interpreter(f, project, self.sizes, self.others.get("settled"))
-        self._text, self._builtin, self._calls = None, None, 0
+        self._text, self._builtin, self._calls, self._in_loops = None, None, 0, 0
 
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self.others, self.sizes)
@@ -235,6 +235,7 @@ class Compiled:
         call : callable
             Computes y from t, x and p.
         """
+        self._in_loops = math.inf
         return self._library.workspace.buffer
 
     def grid(self, t, x, p):
@@ -263,6 +264,7 @@ class Compiled:
         t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
         p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
         y = np.empty((self.n_y, n))
+        self._in_loops += n // BLOCK
         (self._lanes if n > GRID_POINTS else self._library if self.loops else self._interpreter).grid(t, x, p, y)
         return y
 
@@ -317,6 +319,7 @@ class Compiled:
         log = np.append(np.arange(0, n_steps, every), n_steps)
         states, outputs = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
         counts = (int(n_steps), int(every), int(project_every) if self._project is not None else 0)
+        self._in_loops += n_steps * len(tableau[1])
         n = 1 + self._library.rk(float(t0), x0, float(h), counts, p, tableau, states, outputs)
         return t0 + log[:n] * h, states[:, :n], outputs[:, :n]
 
@@ -358,6 +361,7 @@ class Compiled:
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
         nodes = np.empty((most, 1 + self.n_x + self.n_y))
         n, iterations = self._library.continuation(cuts, x0, p, float(longest), nodes)
+        self._in_loops += iterations
         return nodes[:n], iterations
 
     def newton(self, t, nodes, p):
@@ -388,6 +392,7 @@ class Compiled:
         t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
         nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
         z = np.empty((self.n_y - self.sizes.get("pivots", 0), t.size))
+        self._in_loops += t.size
         n, iterations = self._library.newton(t, nodes, p, z)
         return z[:, :n], iterations
 
@@ -430,7 +435,9 @@ class Compiled:
         self._place(self._library, t0, x0, p)
         every = project_every if self._project is not None else 0
         atol, weights = (atol, None) if isinstance(atol, float) else weighted(atol)
-        return self._library.taylor(ends, rtol, atol, every, max_steps, weights)
+        rows = self._library.taylor(ends, rtol, atol, every, max_steps, weights)
+        self._in_loops += len(rows)
+        return rows
 
     def whole(self, start, p, tolerances, most, times, net, judged):
         """A whole motion by the Taylor method in one call, with what shows whether nothing along it needs a decision.
@@ -523,14 +530,17 @@ class Compiled:
     def _projection(self):
         return Interpreter(self._project)
 
-    def native(self, suffix):
+    def native(self, suffix, calls=math.inf):
         """A C function of the library, which is compiled if necessary; None without a compiler.
 
         Parameters
         ----------
         suffix : str
             Name after ``servoctl_NAME_``: "point", "grid", a key of `others`, or a function of a loop's file.
+        calls : float
+            Evaluations for which it is needed, of which `compiler.once` may ask for more: then None, too.
         """
+        self._in_loops += calls
         return self._library.native(suffix)
 
     def _require_loop(self, loop):
@@ -544,27 +554,32 @@ class Compiled:
                 loops=self.loops,
             )
 
-    @functools.cached_property
+    @property
     def _library(self):
         """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
         if "taylor" in self.loops and self.operations > TAYLOR_COMPILED:
             return self._interpreter
-        return self._loaded(self.source)
+        return self._loaded("_library", self.source, self._level)
 
-    @functools.cached_property
+    @property
     def _lanes(self):
         """Evaluator of long grids: a separate library, because twice the code takes twice the time to compile."""
         if "newton" in self.loops:
             return self._library
-        return self._loaded(lambda: emit.emit(self.expression, self._symbol), "-O1")
+        return self._loaded("_lanes", lambda: emit.emit(self.expression, self._symbol), "-O1")
 
-    def _loaded(self, source, level=None):
+    def _loaded(self, name, source, level):
         """Evaluator by the library of a C text, which takes long to write and is not written without a compiler."""
-        if os.environ.get("SERVOCTL_COMPILER") == "none":
-            return self._interpreter
-        library = compiler.library("" if compiler.compiler() is None else source(), level or self._level)
-        self._text = None
-        return self._interpreter if library is None else Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+        if name not in vars(self):
+            text = source() if compiler.compiler() else ""
+            library = compiler.library(text, level, calls=self._in_loops)
+            if library is None and not compiler.repaid(self._in_loops):
+                return self._interpreter
+            self._text, found = None, self._interpreter
+            if library is not None:
+                found = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+            vars(self)[name] = found
+        return vars(self)[name]
 
     @property
     def _level(self):

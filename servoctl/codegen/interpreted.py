@@ -185,7 +185,7 @@ class Interpreter:
     @functools.cached_property
     def _lanes(self):
         """Evaluation of many points: by the `Machine`, else by CasADi; None where tables are looked up."""
-        if (by_operations := machine(self._f)) is not None:
+        if (by_operations := machine(self._f, self._points // BLOCK)) is not None:
             return by_operations
         f = side_by_side(self._f, BLOCK)
         return None if f is None else Blocks(f, self._parts, "C")

@@ -16,13 +16,13 @@ TOGETHER = 64  # points of a block: the values of sixty operations stay in the f
 ENOUGH = 4  # points that are worth a block: CasADi evaluates fewer of them one by one in less time
 
 
-def machine(f):
+def machine(f, calls):
     """The `Machine` of an SX function (t, x, p) -> y; None without a compiler, or where an operation is no arithmetic.
 
     Tables are looked up for each point by itself, and CasADi has its own approximation of the inverse error function.
     """
     used = {f.instruction_id(k) for k in range(f.n_instructions())}
-    if not used <= emit.SAME_BITS or (library := _operations()) is None:
+    if not used <= emit.SAME_BITS or (library := _operations(calls)) is None:
         return None
     return Machine(f, library.servoctl_machine)
 
@@ -61,6 +61,6 @@ class Machine:
 _written = functools.cache(emit.emit_machine)
 
 
-def _operations():
+def _operations(calls):
     """The library of the unit; None without a compiler."""
-    return None if compiler.compiler() is None else compiler.library(_written(TOGETHER), "-O3", exact=True)
+    return compiler.library(_written(TOGETHER), "-O3", True, calls) if compiler.compiler() else None

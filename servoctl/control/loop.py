@@ -96,7 +96,7 @@ def run_loop(ode, law, loop, advance=None):
     (N, n_u).
     """
     n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
-    native = ode.native("closed") if advance is None else None
+    native = ode.native("closed", 4 * loop.samples * loop.substeps) if advance is None else None
     exact = native is not None and not n_z and loop.noise is None and loop.quantum is None  # the law gets states
     logs = {
         "x": np.empty((n, ode.n_x)), "law_x": np.empty((1 if exact else n + 1, n_y + n_z)),
@@ -120,7 +120,7 @@ def _by_columns(x, indices):
 
 def _native(native, law, loop, logs):
     """The loop of closed.c; returns the number of completed samples and the status."""
-    step = law.native("step") if hasattr(law, "native") else None
+    step = law.native("step", loop.samples) if hasattr(law, "native") else None
     failures = []
     if step is None:
         logs["law_y"][:] = np.nan  # ctypes drops an interruption at the entry to the law, and with it the law's answer

@@ -20,6 +20,7 @@ from servoctl.spec.shapes import heights, moved
 from servoctl.values import Value, frozen
 
 MOST_FRAMES = 500  # of an animation: longer motions are shown faster
+SHORTEST = 2.0  # s that an animation lasts at least: shorter motions are shown slower
 PATH_POINTS = 400  # of a drawn path
 STILL = 1e-9  # change of a shape over the motion below which it is the ground, relative to the picture
 BORDER = 0.06  # around the motion, of the picture's larger side
@@ -52,7 +53,7 @@ class Animation(Value):
     fps : float
         Frames per second.
     pace : float
-        Seconds of the motion in a second of the animation: 1, or more for long motions.
+        Seconds of the motion in a second of the animation: 1, more for long motions, less for short ones.
     space : bool
         Whether the picture is a projection of three dimensions.
     """
@@ -67,8 +68,14 @@ class Animation(Value):
 
     def __repr__(self):
         lasts = f"{len(self.t)} frames, {len(self.t) / self.fps:.3g} s"
-        faster = f" ({self.pace:.3g} times as fast as the motion)" if self.pace > 1 else ""
-        return f"Animation: {lasts}{faster}\n  shapes {'; '.join(self.shapes)}"
+        return f"Animation: {lasts}{self.speed}\n  shapes {'; '.join(self.shapes)}"
+
+    @property
+    def speed(self) -> str:
+        """How much faster or slower than the motion the animation is, in words; "" if it is neither."""
+        if self.pace == 1:
+            return ""
+        return f", {self.pace:.3g} times as fast" if self.pace > 1 else f", slowed down {1 / self.pace:.3g} times"
 
     def _repr_html_(self):
         content = base64.b64encode(self.gif()).decode()
@@ -162,14 +169,13 @@ class Animation(Value):
             artist.set_animated(True)
         canvas.draw()
         background = canvas.copy_from_bbox(ax.figure.bbox)
-        pace = f", {self.pace:.3g} times as fast" if self.pace > 1 else ""
         for i, t in enumerate(self.t):
             canvas.restore_region(background)
             for trail, points in zip(trails, self.trails.values(), strict=True):
                 trail.set_data(points[:, : i + 1])
             for moving in artists:
                 moving.show(i)
-            clock.set_text(f"t = {t:.2f} s{pace}")
+            clock.set_text(f"t = {t:.2f} s{self.speed}")
             for artist in changing:
                 ax.draw_artist(artist)
             yield np.array(canvas.buffer_rgba())[..., :3]
@@ -213,8 +219,8 @@ def animate(run, fps=25, trail=None):
             fps=fps,
         )
     _require_drawable(run)
-    span = abs(run.t[-1] - run.t[0])
-    pace = max(1.0, span * fps / (MOST_FRAMES - 1))
+    span = float(abs(run.t[-1] - run.t[0]))
+    pace = max(min(1.0, span / SHORTEST), span * fps / (MOST_FRAMES - 1)) or 1.0
     return _pictured(run, _spread(run, math.floor(span * fps / pace + 1e-9) + 1), trail, float(fps), pace)
 
 

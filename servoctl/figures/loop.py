@@ -4,7 +4,7 @@ import numpy as np
 
 from servoctl.errors import SpecificationError
 from servoctl.figures.names import units_in
-from servoctl.figures.style import BESIDE, COLOURS, label, look, panels
+from servoctl.figures.style import BESIDE, COLOURS, high, label, look, panels
 
 LIMIT = "#A00000"
 
@@ -33,9 +33,17 @@ def closed(run, units=None):
     if not len(run.t):
         raise SpecificationError("The loop ended before its first sample.", do="See run.message.", samples=0)
     units = units_in(run, units)
+    return draw_loop(run, units, panels(heights_of_loop(run, units)))
+
+
+def heights_of_loop(run, units):
+    """Height of each panel of a closed loop."""
+    return [*(high(len(curves)) for _, curves in _errors(run, units)), *(high(4) for _ in run.plant.inputs)]
+
+
+def draw_loop(run, units, axes):
+    """Draw a closed loop in as many Axes."""
     errors = _errors(run, units)
-    count = len(errors) + len(run.plant.inputs)
-    axes = panels(count, 1.0 + 1.9 * count)
     for ax, (text, curves) in zip(axes, errors, strict=False):
         for i, (name, values) in enumerate(curves.items()):
             ax.plot(run.t, values, label=name, **look(i))
@@ -50,7 +58,6 @@ def closed(run, units=None):
         if not run.success:
             _early_end(ax, run)
     axes[-1].set_xlabel("t [s]")
-    axes[0].figure.align_ylabels(list(axes))
     return axes
 
 

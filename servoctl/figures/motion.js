@@ -1,7 +1,7 @@
 // Moves the drawing that this script stands in: its data hold the points of each shape at each frame.
 {
   const figure = document.currentScript.parentElement;
-  const { t, fps, pace, shapes, trails } = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
+  const { t, fps, speed, shapes, trails } = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
   const [button, slider, clock] = ["button", "input", "output"].map((name) => figure.querySelector(name));
   const moving = figure.querySelectorAll(".moving"), trailing = figure.querySelectorAll(".trail");
   let playing = true, since = null, from = 0;
@@ -9,7 +9,7 @@
   const show = (i) => {
     shapes.forEach((frames, k) => moving[k].setAttribute("points", frames[i]));
     trails.forEach((points, k) => trailing[k].setAttribute("points", points.slice(0, i + 1).join(" ")));
-    clock.textContent = `t = ${t[i].toFixed(2)} s` + (pace > 1 ? `, ${pace.toPrecision(3)} times as fast` : "");
+    clock.textContent = `t = ${t[i].toFixed(2)} s${speed}`;
     slider.value = i;
   };
   const play = (now) => {

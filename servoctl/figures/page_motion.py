@@ -60,7 +60,7 @@ def moving_drawing(picture, low, high, kinds):
     lines += [_drawn(f'class="moving" {DRAWN_AS[kinds[name]]}', frames[0]) for name, frames in moving.items()]
     lines += [] if picture.space else _scale_bar(across, up, scale)
     t = np.round(picture.t[::every], 6).tolist()
-    data = {"t": t, "fps": picture.fps / every, "pace": picture.pace}
+    data = {"t": t, "fps": picture.fps / every, "speed": picture.speed}
     data |= {"shapes": list(moving.values()), "trails": trails}
     last, width = len(t) - 1, across / FINE
     return f"""<figure class="motion">

@@ -14,9 +14,11 @@ from servoctl.figures.names import along_one_axis, coordinates, efforts, label_o
 from servoctl.figures.style import (
     BESIDE,
     COLOURS,
+    PANEL,
     STYLES,
     as_axes,
     as_single_axes,
+    high,
     logarithmic,
     look,
     panels,
@@ -132,10 +134,15 @@ def signals(run, *names, ax=None, units=None):
     names = [name for given in names or coordinates(run) for name in texts(given, "The names of signals")]
     if not names:
         raise SpecificationError("No signal was named.", do="Leave names out for the coordinates.", names=names)
+    return over_time(run, by_unit(names, units), ax, units)
+
+
+def by_unit(names, units):
+    """Groups of names of signals of the same unit; one of unknown unit is alone."""
     groups = {}
     for name in names:
         groups.setdefault(unit_of(name, units) or (name,), []).append(name)
-    return _over_time(run, list(groups.values()), ax, units)
+    return list(groups.values())
 
 
 def actuation(run, ax=None, units=None, names=None):
@@ -169,7 +176,7 @@ def actuation(run, ax=None, units=None, names=None):
     if not names:
         rule = "It needs a model, or stored signals."
         raise SpecificationError("The run has no actuation.", rule, do="Give names of signals.", names=run.names)
-    return _over_time(run, [[name] for name in names], ax, units_in(run, units), extrema=True)
+    return over_time(run, [[name] for name in names], ax, units_in(run, units), extrema=True)
 
 
 def residuals(run, ax=None):
@@ -233,18 +240,13 @@ def save_figures(run, folder, units=None, title=""):
     """
     require_kind(Run, "run", run, SOURCE)
     text("title", title)
-    return write_figures(run, folder, units, title)
-
-
-def write_figures(run, folder, units, title, left_out=()):
-    """As `save_figures`, but for the figures of some names."""
     drawn = {"path": path} if planes(run) else {}
     drawn |= {"coordinates": signals}
     if efforts(run):
         drawn["actuation"] = actuation
     if len(run.residual):
         drawn["residuals"] = lambda run, units: residuals(run)
-    drawn = {name: draw(run, units=units) for name, draw in drawn.items() if name not in left_out}
+    drawn = {name: draw(run, units=units) for name, draw in drawn.items()}
     files = []
     with writing(folder, "figures", folder=True) as folder:
         for name, axes in drawn.items():
@@ -255,13 +257,18 @@ def write_figures(run, folder, units, title, left_out=()):
     return files
 
 
-def _over_time(run, groups, ax, units, extrema=False):
+def heights_of(groups):
+    """Heights of panels with the legends of groups of names: a single one is higher."""
+    return [max(high(len(group)), 2 * PANEL / len(groups)) for group in groups]
+
+
+def over_time(run, groups, ax, units, extrema=False):
     """Draw groups of signals: one panel for each, or all in `ax` if that is a single Axes."""
     given = as_axes(ax)
     single = len(given) == 1 and given[0] is ax
     if single:
         groups = [[name for group in groups for name in group]]
-    axes = np.ravel(panels(len(groups), max(4.2, 1.0 + 1.9 * len(groups))) if ax is None else given)
+    axes = np.ravel(panels(heights_of(groups)) if ax is None else given)
     if len(axes) != len(groups):
         raise SpecificationError(
             f"{len(axes)} Axes were given.",
@@ -282,9 +289,8 @@ def _over_time(run, groups, ax, units, extrema=False):
         if len(group) > 1:
             panel.legend(**BESIDE)
         if extrema:
-            panel.set_title("\n".join(_extrema_text(run, name, units) for name in group), fontsize="small", loc="left")
+            panel.set_title("\n".join(extrema_text(run, name, units) for name in group), fontsize="small", loc="left")
     axes[-1].set_xlabel("t [s]")
-    axes[0].figure.align_ylabels(list(axes))
     _instants(run, axes)
     _end(run, axes)
     return axes[0] if single else axes
@@ -316,7 +322,8 @@ def _frame(ax, run, names, largest):
         ax.set_ylim(early.min() - np.ptp(early) / 2, early.max() + np.ptp(early) / 2)
 
 
-def _extrema_text(run, name, units):
+def extrema_text(run, name, units):
+    """The least and the greatest value of a signal, with their instants."""
     if not np.all(np.isfinite(run[name])):
         return f"{name}: not finite at some instants"
     unit = unit_of(name, units)

@@ -4,13 +4,13 @@ import numpy as np
 
 from servoctl.errors import SpecificationError
 from servoctl.figures.names import label_of, units_in
-from servoctl.figures.style import BESIDE, as_axes, look, panels
+from servoctl.figures.style import BESIDE, as_axes, high, look, panels
 
 
 def draw_sensitivity(sensitivity, ax=None, units=None):
     """Draw the change of each signal, one panel for each, if each number grows by `sensitivity.change`."""
     of, units, given = sensitivity.of, units_in(sensitivity.run, units), as_axes(ax)
-    axes = np.ravel(panels(len(of), max(4.2, 1.0 + 2.4 * len(of))) if ax is None else given)
+    axes = np.ravel(panels([max(2.2, high(len(sensitivity.to)))] * len(of)) if ax is None else given)
     if len(axes) != len(of):
         raise SpecificationError(
             f"{len(axes)} Axes were given.",

@@ -1,5 +1,6 @@
-"""Shared by all figures: colours, line styles, panels, legends, labels."""
+"""Shared by all figures: colours, line styles, panels and their layout, legends, labels."""
 
+import functools
 import re
 
 import numpy as np
@@ -11,8 +12,12 @@ SOURCE = "matplotlib.pyplot.subplots()"
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 MORE = ("#8C6D31", "#7F7F7F", "#5E3C99", "#882255", "#44AA99", "#B5BD00", "#FF7F9F")  # for more curves
+INSTANTS = 6  # intervals of a time axis, at most
 STYLES = ("-", "--", ":", "-.")
 FIGURE_WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
+PANEL, ENTRY = 1.5, 0.22  # inches: height of a panel, of an entry of its legend
+LEFT, BELOW, LABEL = 1.1, 0.5, 0.85  # inches: for ticks and labels beside and below a panel, from its label to the axis
+LINE, PAD = 0.2, 0.08  # inches: a line of a title, a gap
 BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False}  # a legend to the right of its panel
 
 
@@ -20,13 +25,61 @@ def figure(height, rows=1, columns=1, width=FIGURE_WIDTH, **options):
     """A figure outside pyplot, which leaves the user's backend unchanged, and its (rows, columns) array of Axes."""
     from matplotlib.figure import Figure
 
-    empty = Figure(figsize=(width, height), dpi=100, layout="constrained")
+    empty = Figure(figsize=(width, height), dpi=100, layout=column() if columns == 1 else "constrained")
     return empty, empty.subplots(rows, columns, squeeze=False, **options)
 
 
-def panels(count, height, **options):
-    """Axes one above the other in a new figure, with one time axis."""
-    return figure(height, rows=count, sharex=True, **options)[1][:, 0]
+@functools.cache
+def column():
+    """A layout of panels one above the other, of which legends and titles alone are measured.
+
+    matplotlib's "constrained", which measures every text several times, takes longer than drawing.
+    """
+    from matplotlib.layout_engine import LayoutEngine
+
+    class Column(LayoutEngine):
+        _adjust_compatible = _colorbar_gridspec = True
+
+        def __reduce__(self):
+            return column, ()
+
+        def execute(self, fig):
+            renderer, (width, height) = fig._get_renderer(), fig.get_size_inches()
+            legends = [ax.get_legend() for ax in fig.axes if ax.get_legend()]
+            beside = [legend.get_window_extent(renderer).x1 - legend.axes.bbox.x1 for legend in legends]
+            left = LEFT if any(ax.axison for ax in fig.axes) else 2 * PAD
+            across = width - left - PAD - max([PAD, *(part / fig.dpi for part in beside)])
+            titles = [text for text in fig.texts if text.get_text() and text.get_text() == fig.get_suptitle()]
+            top = height - sum(PAD + text.get_window_extent(renderer).height / fig.dpi for text in titles)
+            for text in titles:
+                text.set_y(1 - PAD / height)
+            above = np.array([PAD + LINE * max(1, _title_lines(ax)) for ax in fig.axes])
+            shares = np.array(fig.axes[0].get_gridspec().get_height_ratios(), dtype=float)
+            up = shares / shares.sum() * (top - above.sum() - BELOW)
+            for ax, low, tall in zip(fig.axes, top - np.cumsum(above + up), up, strict=True):
+                ax.set_position([left / width, low / height, across / width, tall / height])
+                ax.set_in_layout(True)  # which `set_position` ends
+                if ax.get_aspect() == "auto":
+                    ax.yaxis.set_label_coords(-LABEL / across, 0.5)
+
+    return Column()
+
+
+def _title_lines(ax):
+    return max(len(ax.get_title(place).splitlines()) for place in ("left", "center", "right"))
+
+
+def panels(heights, **options):
+    """Axes one above the other with heights [inches] and one time axis, in a new figure."""
+    height = sum(heights) + (PAD + LINE) * (len(heights) + 1) + BELOW
+    axes = figure(height, rows=len(heights), sharex=True, height_ratios=heights, **options)[1][:, 0]
+    axes[0].locator_params("x", nbins=INSTANTS)  # of all: making its ticks takes most of the time of a panel
+    return axes
+
+
+def high(entries):
+    """Height of a panel with so many entries of its legend [inches]."""
+    return max(PANEL, ENTRY * entries)
 
 
 def as_axes(ax):
@@ -41,14 +94,14 @@ def as_single_axes(ax, height, **options):
     """A given Axes, or one in a new figure."""
     from matplotlib.axes import Axes
 
-    return panels(1, height, **options)[0] if ax is None else require_kind(Axes, "ax", ax, SOURCE)
+    return figure(height, **options)[1][0, 0] if ax is None else require_kind(Axes, "ax", ax, SOURCE)
 
 
 def write_png(drawn, path):
-    """Write a figure to a file, laid out and drawn once; `savefig` does both twice."""
+    """Write a figure to a file, laid out and drawn once; `savefig` does both twice, and packs more tightly."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    FigureCanvasAgg(drawn).print_png(path)
+    FigureCanvasAgg(drawn).print_png(path, pil_kwargs={"compress_level": 1})
 
 
 def logarithmic(ax):

@@ -13,11 +13,8 @@ from servoctl.errors import ServoError
 from servoctl.shell.printing import complain
 from servoctl.study.table import machine
 
-FILES = (
-    "index.html", "run.npz", "summary.json", "report.txt", "motion.png", "path.png", "coordinates.png", "actuation.png",
-    "residuals.png",
-)  # fmt: skip
-LOOP_FILES = ("closed_loop.npz", "closed_loop.png")
+FILES = ("index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt", "motion.png", "sheet.png")
+FIGURES = ("path.png", "coordinates.png", "actuation.png", "residuals.png", "closed_loop.png")  # by --all-figures
 ANIMATION = "motion.gif"
 
 
@@ -41,7 +38,7 @@ class Folder:
             raise ServoError(
                 f"The folder {str(path).encode(errors='backslashreplace').decode()} cannot be written: {reason}.",
                 f"Numbers and figures of a run are written to a folder, by default {Path('servoctl-runs', name)}.",
-                do="Give another folder by --out. Nothing has been computed yet.",
+                do=f"Give another one: --out {Path(tempfile.gettempdir(), name)}. Nothing has been computed yet.",
                 folder=str(path),
             ) from error
 
@@ -67,7 +64,7 @@ class Folder:
         """
         try:
             if not self._actions:
-                for name in (*FILES, *LOOP_FILES, ANIMATION):
+                for name in (*FILES, *FIGURES, ANIMATION):
                     (self.path / name).unlink(missing_ok=True)
             action(self.path)
         except (OSError, ServoError) as error:
@@ -133,7 +130,6 @@ def summary(run, start, verification):
             "residual": start.residual,
         },
         "structure": _structure(model),
-        "operations": model.operations(),
         "extrema": {n: _extrema(run, n) for n in dict.fromkeys([*sv.figures.efforts(run), *model.outputs])},
         "residuals": {name: {"worst": _worst(levels), "levels": levels} for name, levels in residuals.items()},
         "verification": verified,

@@ -1,10 +1,12 @@
 """The command line: its parser. The module of a command is imported when it is the one that is given."""
 
 import argparse
+import re
 import sys
+import warnings
 from importlib import import_module
 
-from servoctl.errors import ServoError
+from servoctl.errors import ServoError, unknown
 from servoctl.shell.printing import complain
 from servoctl.version import __version__
 
@@ -35,8 +37,11 @@ def main(argv=None):
         error, explained on stderr; 3 the verification is inconclusive; 130 interrupted.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
-    args = _parser(argv).parse_args(argv)
+    args, left = _parser(argv).parse_known_args(argv)
+    if left:
+        args.parser.error(f"unrecognized argument {left[0]!r}" + _nearest(left[0], args.parser.format_help()))
     args.command_line = argv
+    warnings.formatwarning = lambda message, *_: f"{message}\n"  # one line, without places in the sources
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a run must not fail because a terminal has no Greek letters
@@ -50,8 +55,20 @@ def main(argv=None):
         return 130
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        """End with one line, where argparse prints all options before it."""
+        self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
+
+
+def _nearest(given, text):
+    """The option or the command in a help's text that is nearest to a given one."""
+    match = unknown(given.partition("=")[0], re.findall(r"(?<!\S)--[\w-]+", text), "option").details["match"]
+    return f"; nearest: {match}" if match else ""
+
+
 def _parser(argv):
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="servoctl",
         description="Inverse dynamics, simulation and control of machines under programs (servo constraints).",
         epilog="Examples: servoctl run overhead-crane;  servoctl run overhead-crane --set m_load=115;  "
@@ -62,8 +79,11 @@ def _parser(argv):
     )
     commands = parser.add_subparsers(required=True, metavar="command")
     given = next((text for text in argv if not text.startswith("-")), None)
+    if given not in (None, *COMMANDS):
+        parser.error(str(unknown(given, COMMANDS, "command")).rstrip("."))
     for name, (module, add, about) in COMMANDS.items():
         command = commands.add_parser(name, help=about)
+        command.set_defaults(parser=command)
         if name == given:
             getattr(import_module(f"servoctl.shell.{module}"), add)(command)
     return parser

@@ -13,15 +13,12 @@ VERSIONS = ("", "version")
 PICTURES = {  # file: what it shows
     "motion.png": "The mechanism at instants from the start (light) to the end (dark), over the programmed path;"
     " side by side where it turns in place.",
-    "path.png": "The path.",
-    "coordinates.png": "Coordinates.",
-    "actuation.png": "Required actuation, with its extrema.",
-    "closed_loop.png": "The closed loop.",
-    "residuals.png": "Residuals of the constraints and their derivatives.",
+    "sheet.png": "Coordinates, required actuation with its extrema, residuals of the constraints and their derivatives,"
+    " and the closed loop.",
 }
 STYLE = """
 body { font: 16px/1.45 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-img { max-width: 100%; } figure { margin: 1.2rem 0; } figcaption { color: #555; }
+img { max-width: max(100%, 44rem); } figure { margin: 1.2rem 0; overflow-x: auto; } figcaption { color: #555; }
 table { border-collapse: collapse; margin: .6rem 0 1.2rem; display: block; overflow-x: auto; }
 th, td { padding: .2rem .9rem .2rem 0; text-align: left; }
 td.n, th.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }

@@ -4,9 +4,11 @@ import warnings
 from dataclasses import replace
 
 import servoctl as sv
+from servoctl.codegen.compiler import once
+from servoctl.codegen.function import CALLS
 from servoctl.errors import ServoError
 from servoctl.figures.animation import shows_mechanism
-from servoctl.figures.run import write_figures
+from servoctl.figures.sheet import draw_sheet
 from servoctl.figures.style import write_png
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.methods.bounded import Problem
@@ -14,9 +16,10 @@ from servoctl.methods.choice import Bounded, as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
 from servoctl.progress import stage
 from servoctl.shell import loop
-from servoctl.shell.folder import ANIMATION, FILES, LOOP_FILES, folder_of, jsonable, summary
+from servoctl.shell.folder import ANIMATION, FIGURES, folder_of, jsonable, summary
 from servoctl.shell.motion import described
 from servoctl.shell.options import METHODS_HELP, VERBOSE, add_motion, drift, samples, used
+from servoctl.shell.page import NAME as PAGE
 from servoctl.shell.page import write_page
 from servoctl.shell.printing import Report, complain
 from servoctl.shell.scenes import find_scene
@@ -37,7 +40,9 @@ def add_run(run):
     run.add_argument("--atol", type=float, help="absolute tolerance")
     run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")
     run.add_argument("--no-verify", action="store_true", help="leave out the check against the full mechanism")
-    run.add_argument("--no-figures", action="store_true", help="leave out the figures")
+    figures = run.add_mutually_exclusive_group()
+    figures.add_argument("--no-figures", action="store_true", help="leave out the figures")
+    figures.add_argument("--all-figures", action="store_true", help=f"write {', '.join(FIGURES)}, too")
     run.add_argument("--verbose", **VERBOSE)
     run.add_argument("--animate", action="store_true", help=f"write the motion to a file, too: {ANIMATION}")
     loop.add_loop(run)
@@ -46,7 +51,7 @@ def add_run(run):
 
 def _run(args):
     name, scene = find_scene(args.scene)
-    with folder_of(args, name) as folder:
+    with folder_of(args, name) as folder, once(CALLS):
         return _compute(args, name, scene, folder)
 
 
@@ -73,13 +78,13 @@ def _compute(args, name, scene, folder):
     folder.write_text("report.txt", report.text)
     motion = _pictures_of(args, folder, name, run, closed)
     folder.write(lambda path: write_page(path, jsonable(facts), run.units, verification, report.text, motion))
-    print(f"{', '.join(f for f in (*FILES, *LOOP_FILES, ANIMATION) if (folder.path / f).exists())} in {folder.path}")
     if not run.success:
         complain(f"The motion ended early, at t = {run.t[-1]:.6g} s; what was computed is kept.")
     unstable = run.internal.get("verdict") == "unstable"
     if unstable:
         complain(f"The plan is not to be trusted: {run.internal['text']}.")
     verified = "passed" if args.no_verify else getattr(verification, "verdict", "failed")
+    print(f"open {folder.path / PAGE}")
     if unstable or not (run.success and verified != "failed" and done and not folder.moved):
         return 1
     return INCONCLUSIVE if verified == "inconclusive" else 0
@@ -89,22 +94,22 @@ def _compute(args, name, scene, folder):
 def _pictures_of(args, folder, name, run, closed):
     """Write the figures, and the GIF if it is wanted; returns the motion as HTML: in the loop if there is one."""
     moving = run if closed is None else closed
-    shown, left_out = shows_mechanism(moving), ("path",) if run.model.reduction.mechanism.shapes else ()
-    if not args.no_figures:
-        folder.write(lambda path: write_figures(run, path, None, name, left_out))
+    shown, drawn = shows_mechanism(moving), not args.no_figures
+    if drawn:
+        folder.write(lambda path: write_png(draw_sheet(run, closed, name), path / "sheet.png"))
+    if args.all_figures:
+        folder.write(lambda path: sv.figures.save_figures(run, path, title=name))
         if closed is not None:
             folder.write(lambda path: loop.save_figure(closed, path, name))
-    if not shown:
-        if args.animate:
-            complain("There is no animation: the mechanism has no shapes=, and no outputs or coordinates like X and Z.")
-        return ""
-    if not args.no_figures:
+    if args.animate and not shown:
+        complain("There is no animation: the mechanism has no shapes=, and no outputs or coordinates like X and Z.")
+    if drawn and shown:
         what = f"{name}: motion" + (", in the closed loop" if closed is not None else "")
         axes = sv.figures.stroboscope(moving, title=what)
         folder.write(lambda path: write_png(axes.figure, path / "motion.png"))
-    if args.animate:
+    if args.animate and shown:
         folder.write(lambda path: sv.figures.animate(moving).save(path / ANIMATION))
-    return "" if args.no_figures else sv.figures.animate(moving).html()
+    return sv.figures.animate(moving).html() if drawn and shown else ""
 
 
 def _planned(args, motion, report):
