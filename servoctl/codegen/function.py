@@ -191,26 +191,9 @@ class Compiled:
         return loaded.get("_lanes", loaded.get("_library", self._interpreter)).backend
 
     def __call__(self, t, x, p):
-        """Evaluate at one point.
+        """Evaluate at one point: t [s], x (n_x,) and p (n_p,), SI; returns a new (n_y,) array.
 
-        Parameters
-        ----------
-        t : float
-            Time [s].
-        x : (n_x,) array
-            State, SI.
-        p : (n_p,) array
-            Parameters, SI.
-
-        Returns
-        -------
-        (n_y,) array
-            A new array at each call.
-
-        Raises
-        ------
-        SpecificationError
-            If x or p has another shape.
+        Raises SpecificationError if x or p has another shape.
         """
         if self._builtin is not None:
             return self._builtin(float(t), self._array("x", x, self._x_shape), self._array("p", p, self._p_shape))
@@ -225,39 +208,18 @@ class Compiled:
         return row_y.copy()
 
     def buffer(self):
-        """Arrays and a call without arguments, for loops in Python over single evaluations.
+        """Arrays t (1,), x (n_x,), p (n_p,), y (n_y,) and a call without arguments that computes y from the others.
 
-        They belong to the calling thread; its other evaluations overwrite them.
-
-        Returns
-        -------
-        t, x, p, y : (1,), (n_x,), (n_p,), (n_y,) arrays
-        call : callable
-            Computes y from t, x and p.
+        For loops in Python over single evaluations. They belong to the calling thread; its other evaluations overwrite
+        them.
         """
         self._in_loops = math.inf
         return self._library.workspace.buffer
 
     def grid(self, t, x, p):
-        """Evaluate at N points.
+        """Evaluate at N points: times (N,) or one [s], states x (n_x, N), parameters p (n_p,) or (n_p, N); (n_y, N).
 
-        Parameters
-        ----------
-        t : float or (N,) array
-            Times [s].
-        x : (n_x, N) array
-            One state per column, SI.
-        p : (n_p,) or (n_p, N) array
-            Parameters, SI; a matrix has one column per point.
-
-        Returns
-        -------
-        (n_y, N) array
-
-        Raises
-        ------
-        SpecificationError
-            If the shapes disagree.
+        Raises SpecificationError if the shapes disagree.
         """
         n = np.shape(x)[-1] if np.ndim(x) == 2 else np.size(t)
         x = self._array("x", x, (self.n_x, n))
@@ -269,42 +231,14 @@ class Compiled:
         return y
 
     def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
-        """Integrate dx/dt, the first n_x outputs, by explicit Runge-Kutta steps.
+        """Integrate dx/dt, the first n_x outputs, by explicit Runge-Kutta steps of h [s] from t0 and x0 (n_x,).
 
-        Step k starts at t0 + k h. The run ends before the first state that is not finite.
-
-        Parameters
-        ----------
-        t0 : float
-            Start [s].
-        x0 : (n_x,) array
-            State at t0, SI.
-        h : float
-            Step [s]; negative runs backwards.
-        n_steps : int
-            Number of steps.
-        p : (n_p,) array
-            Parameters, SI.
-        tableau : (a, b, c)
-            Coefficients of s stages: (s, s) array, strictly lower triangular, (s,) and (s,) arrays.
-        every : int
-            Number of steps between logged points; the start and the end are always logged.
-        project_every : int
-            Number of steps between projections; 0 for no projection.
-
-        Returns
-        -------
-        t : (N,) array
-            Logged times [s].
-        x : (n_x, N) array
-            States at these times, SI.
-        outputs : (n_y - n_x, N) array
-            The further outputs at these times.
-
-        Raises
-        ------
-        SpecificationError
-            If the function has no loop "rk", an array has another shape, or a count is out of range.
+        Step k starts at t0 + k h; a negative h runs backwards. The run ends before the first state that is not finite.
+        `tableau` has the coefficients a (s, s), strictly lower triangular, b (s,) and c (s,) of s stages. Of the steps
+        every `every`-th is logged, and the start and the end always; the state is projected after every
+        `project_every`-th, never for 0. Returns the logged times t (N,), states (n_x, N) and further outputs
+        (n_y - n_x, N). Raises SpecificationError for a function without this loop, another shape, or a count out of
+        range.
         """
         self._require_loop("rk")
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
@@ -329,32 +263,10 @@ class Compiled:
         A step is predicted by the rates and corrected. It is halved until Newton's corrections shrink quickly, the
         predictions from both its ends are right up to a small part of the way, and no pivot (the last
         ``sizes["pivots"]`` outputs) changes its sign or its size by more than a factor of 4: the path cannot change to
-        another branch of the solution.
-
-        Parameters
-        ----------
-        cuts : (C,) array
-            Start, instants at which steps end, and end [s]; in order, also backwards.
-        x0 : (n_x,) array
-            Start of the iteration at cuts[0], SI.
-        p : (n_p,) array
-            Parameters, SI.
-        longest : float
-            Longest step [s].
-        most : int
-            Largest number of nodes.
-
-        Returns
-        -------
-        nodes : (M, 1 + n_x + n_y) array
-            t, x and outputs at the ends of the steps. If M < most, the path ends where the last node lies.
-        iterations : int
-            Number of evaluations.
-
-        Raises
-        ------
-        SpecificationError
-            If the function has no loop "newton", or an array has another shape.
+        another branch of the solution. `cuts` (C,) has the start, instants at which steps end, and the end, in order,
+        also backwards; x0 (n_x,) starts the iteration there. Returns at most `most` nodes (M, 1 + n_x + n_y), t, x and
+        outputs at the ends of steps no longer than `longest` [s], and the number of evaluations. If M < most, the path
+        ends where the last node lies.
         """
         self._require_loop("newton")
         cuts = self._array("cuts", cuts, (np.size(cuts),))
@@ -365,28 +277,13 @@ class Compiled:
         return nodes[:n], iterations
 
     def newton(self, t, nodes, p):
-        """Solve at times along the path of a `continuation`.
+        """Solve at times t (N,) along the path of a `continuation`, in the order of its nodes.
 
         A point is predicted by Hermite's interpolation between two nodes and corrected until every
         |delta_i| <= 1e-13 (1 + |x_i|); by further steps of the path from the node before it, where that fails.
-        Compiled code takes eight points at once, CasADi 128.
-
-        Parameters
-        ----------
-        t : (N,) array
-            Times in the order of the nodes [s].
-        nodes : (M, 1 + n_x + n_y) array
-            From `continuation`.
-        p : (n_p,) array
-            Parameters, SI.
-
-        Returns
-        -------
-        z : (n_y - pivots, K) array
-            Solutions x at the first K times, dx/dt, d²x/dt² and others; K < N if the iteration fails at t[K], or a rate
-            is not finite there.
-        iterations : int
-            Number of evaluations.
+        Compiled code takes eight points at once, CasADi 128. Returns the solutions x at the first K times, dx/dt,
+        d²x/dt² and others, (n_y - pivots, K), and the number of evaluations; K < N if the iteration fails at t[K], or a
+        rate is not finite there.
         """
         self._require_loop("newton")
         t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
@@ -399,37 +296,12 @@ class Compiled:
     def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then pivots.
 
-        A step is as long as its last term meets the tolerance at every level of the state.
-
-        Parameters
-        ----------
-        t0 : float
-            Start [s].
-        x0 : (n_x,) array
-            State at t0, SI.
-        ends : float or (N,) array
-            Instants at which a step ends, in the direction of motion, the last one the end [s]. Between two of them
-            paths have one branch.
-        p : (n_p,) array
-            Parameters, SI. The last one, the instant that selects the branches of paths, is set for each step.
-        rtol, atol : float
-            Tolerances of each level of the state: relative to its largest entry, and absolute. With atol (n_x,), of a
-            level each of whose entries is measured in its own absolute tolerance.
-        max_steps : int
-            Largest number of steps.
-        project_every : int
-            Number of steps between projections; 0 for no projection.
-
-        Returns
-        -------
-        (S + 1, 1 + n_x + n_y) array
-            t, x and outputs at the starts of the S steps, and t and x at the end of the last one, which lies before the
-            last end if the step length vanishes.
-
-        Raises
-        ------
-        SpecificationError
-            If the function has no loop "taylor", or an array has another shape.
+        A step is as long as its last term meets the tolerance at every level of the state: `rtol` relative to the
+        level's largest entry, and `atol`, a number, or (n_x,) where each entry of a level is measured in its own. A
+        step ends at each of `ends`, in the direction of motion; between two of them paths have one branch, which the
+        last parameter, an instant, selects. The state is projected after every `project_every`-th step, never for 0.
+        Returns t, x and outputs at the starts of the S steps, and t and x at the end of the last one, as
+        (S + 1, 1 + n_x + n_y); it lies before the last end if the step length vanishes, or S is `max_steps`.
         """
         self._require_loop("taylor")
         self._place(self._library, t0, x0, p)
@@ -442,35 +314,15 @@ class Compiled:
     def whole(self, start, p, tolerances, most, times, net, judged):
         """A whole motion by the Taylor method in one call, with what shows whether nothing along it needs a decision.
 
-        Parameters
-        ----------
-        start : (t0, (n_x,) array, ends)
-            Start [s], the state there, and the end or the instants (K,) at which steps end [s].
-        p : (n_p,) array
-        tolerances : (rtol, atol)
-            As for `taylor`.
-        most : int
-            Largest number of steps.
-        times : (N,) array
-            Samples in the order of the motion [s].
-        net : ((M,) array, float, bool)
-            Where series are compared with the equations: parts of each step, and a distance of instants [s]; not at
-            the end if that is a knot.
-        judged : (rtol, atol)
-            Of the states, which judge "invariants".
-
-        Returns
-        -------
-        steps : int
-        jets : (nq + s̄ n, N) array
-            q, γ', ..., γ^(s̄) at the samples, by "settled" if there is one.
-        facts : list of arrays
-            How far γ^(s̄) of the series is from that of "rates" (n,), the longest step (1,), the largest sizes of the
-            states (n_x,) and, after the start, of "invariants" relative to their tolerances there (m,), the least size
-            of each pivot, 0 where its sign changes, and the largest one, and (1,) the largest of the "invariants" at
-            the end, relative to its gradient times the state.
-        None
-            If the steps do not reach the end, samples are not finite, or nothing is compiled.
+        `start` has t0, the state there and the ends of `taylor`; `times` (N,) are samples in the order of the motion.
+        In `net`, at (M,) parts of each step and at a distance of instants [s], series are compared with the equations,
+        not at the end if that is a knot (its third entry); `judged` has (rtol, atol) of the states, which judge
+        "invariants". Returns the number of steps; the jets q, γ', ..., γ^(s̄) at the samples, by "settled" if there is
+        one; and facts: how far γ^(s̄) of the series is from that of "rates" (n,), the longest step (1,), the largest
+        sizes of the states (n_x,) and, after the start, of "invariants" relative to their tolerances there (m,), the
+        least size of each pivot, 0 where its sign changes, and the largest one, and (1,) the largest of the
+        "invariants" at the end, relative to its gradient times the state. None if the steps do not reach the end,
+        samples are not finite, or nothing is compiled.
         """
         self._require_loop("taylor")
         self._place(self._library, start[0], start[1], p)
@@ -486,27 +338,10 @@ class Compiled:
         return *found[:2], [found[2][a:b] for a, b in itertools.pairwise(ends)]
 
     def jets(self, log, k, t, p, levels, by_rows=False):
-        """The jets q, γ', ..., γ^(levels) at instants within the steps of `taylor`.
+        """The jets q, γ', ..., γ^(levels), (nq + levels n, N), at times t (N,) within the steps k (N,) of `taylor`.
 
-        Parameters
-        ----------
-        log : (S + 1, 1 + n_x + n_y) array
-            From `taylor`.
-        k : (N,) array of int
-            Steps, 0 .. S - 1.
-        t : (N,) array
-            Times [s].
-        p : (n_p,) array
-            Parameters, SI; those of `taylor`.
-        levels : int
-            Below ``sizes["last"]``.
-        by_rows : bool
-            Whether "settled" gives the rates up to γ^(s̄), if there is one; levels must then include them. Not where a
-            pivot may vanish.
-
-        Returns
-        -------
-        (nq + levels n, N) array
+        `levels` is below ``sizes["last"]``. With `by_rows`, "settled" gives the rates up to γ^(s̄), if there is one;
+        levels must then include them. Not where a pivot may vanish.
         """
         k, t = np.ascontiguousarray(k, dtype=np.int64), np.ascontiguousarray(t, dtype=float)
         z = np.empty((self.sizes["nq"] + levels * self.sizes["n"], t.size))
@@ -533,12 +368,8 @@ class Compiled:
     def native(self, suffix, calls=math.inf):
         """A C function of the library, which is compiled if necessary; None without a compiler.
 
-        Parameters
-        ----------
-        suffix : str
-            Name after ``servoctl_NAME_``: "point", "grid", a key of `others`, or a function of a loop's file.
-        calls : float
-            Evaluations for which it is needed, of which `compiler.once` may ask for more: then None, too.
+        Its name follows ``servoctl_NAME_``: "point", "grid", a key of `others`, or a function of a loop's file. `calls`
+        are evaluations for which it is needed, of which `compiler.once` may ask for more: then None, too.
         """
         self._in_loops += calls
         return self._library.native(suffix)
