@@ -120,7 +120,7 @@ def _by_columns(x, indices):
 
 def _native(native, law, loop, logs):
     """The loop of closed.c; returns the number of completed samples and the status."""
-    step = law.native("step", loop.samples) if hasattr(law, "native") else None
+    step = law.native("step") if hasattr(law, "native") else None
     failures = []
     if step is None:
         logs["law_y"][:] = np.nan  # ctypes drops an interruption at the entry to the law, and with it the law's answer

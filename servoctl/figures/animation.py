@@ -20,7 +20,7 @@ from servoctl.spec.shapes import heights, moved
 from servoctl.values import Value, frozen
 
 MOST_FRAMES = 500  # of an animation: longer motions are shown faster
-SHORTEST = 2.0  # s that an animation lasts at least: shorter motions are shown slower
+SLOWED = 2.0  # s that an animation lasts at least: shorter motions are shown slower
 PATH_POINTS = 400  # of a drawn path
 STILL = 1e-9  # change of a shape over the motion below which it is the ground, relative to the picture
 BORDER = 0.06  # around the motion, of the picture's larger side
@@ -220,7 +220,7 @@ def animate(run, fps=25, trail=None):
         )
     _require_drawable(run)
     span = float(abs(run.t[-1] - run.t[0]))
-    pace = max(min(1.0, span / SHORTEST), span * fps / (MOST_FRAMES - 1)) or 1.0
+    pace = max(min(1.0, span / SLOWED), span * fps / (MOST_FRAMES - 1)) or 1.0
     return _pictured(run, _spread(run, math.floor(span * fps / pace + 1e-9) + 1), trail, float(fps), pace)
 
 

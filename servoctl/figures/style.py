@@ -12,12 +12,12 @@ SOURCE = "matplotlib.pyplot.subplots()"
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 MORE = ("#8C6D31", "#7F7F7F", "#5E3C99", "#882255", "#44AA99", "#B5BD00", "#FF7F9F")  # for more curves
-INSTANTS = 6  # intervals of a time axis, at most
+TICKS = 6  # intervals of a time axis, at most
 STYLES = ("-", "--", ":", "-.")
 FIGURE_WIDTH = 10.0  # inches: 1000 px at matplotlib's 100 dpi
 PANEL, ENTRY = 1.5, 0.22  # inches: height of a panel, of an entry of its legend
 LEFT, BELOW, LABEL = 1.1, 0.5, 0.85  # inches: for ticks and labels beside and below a panel, from its label to the axis
-LINE, PAD = 0.2, 0.08  # inches: a line of a title, a gap
+TITLE, PAD = 0.2, 0.08  # inches: a line of a title, a gap
 BESIDE = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.0), "frameon": False}  # a legend to the right of its panel
 
 
@@ -53,7 +53,7 @@ def column():
             top = height - sum(PAD + text.get_window_extent(renderer).height / fig.dpi for text in titles)
             for text in titles:
                 text.set_y(1 - PAD / height)
-            above = np.array([PAD + LINE * max(1, _title_lines(ax)) for ax in fig.axes])
+            above = np.array([PAD + TITLE * max(1, _title_lines(ax)) for ax in fig.axes])
             shares = np.array(fig.axes[0].get_gridspec().get_height_ratios(), dtype=float)
             up = shares / shares.sum() * (top - above.sum() - BELOW)
             for ax, low, tall in zip(fig.axes, top - np.cumsum(above + up), up, strict=True):
@@ -71,9 +71,9 @@ def _title_lines(ax):
 
 def panels(heights, **options):
     """Axes one above the other with heights [inches] and one time axis, in a new figure."""
-    height = sum(heights) + (PAD + LINE) * (len(heights) + 1) + BELOW
+    height = sum(heights) + (PAD + TITLE) * (len(heights) + 1) + BELOW
     axes = figure(height, rows=len(heights), sharex=True, height_ratios=heights, **options)[1][:, 0]
-    axes[0].locator_params("x", nbins=INSTANTS)  # of all: making its ticks takes most of the time of a panel
+    axes[0].locator_params("x", nbins=TICKS)  # of all: making its ticks takes most of the time of a panel
     return axes
 
 

@@ -39,7 +39,7 @@ def main(argv=None):
     argv = list(sys.argv[1:] if argv is None else argv)
     args, left = _parser(argv).parse_known_args(argv)
     if left:
-        args.parser.error(f"unrecognized argument {left[0]!r}" + _nearest(left[0], args.parser.format_help()))
+        args.parser.error(f"unrecognized argument {left[0]!r}" + _option_like(left[0], args.parser.format_help()))
     args.command_line = argv
     warnings.formatwarning = lambda message, *_: f"{message}\n"  # one line, without places in the sources
     for stream in (sys.stdout, sys.stderr):
@@ -61,7 +61,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
 
 
-def _nearest(given, text):
+def _option_like(given, text):
     """The option or the command in a help's text that is nearest to a given one."""
     match = unknown(given.partition("=")[0], re.findall(r"(?<!\S)--[\w-]+", text), "option").details["match"]
     return f"; nearest: {match}" if match else ""
