@@ -31,13 +31,13 @@ INERTIAS = ("m", "j", "density")  # how names of parameters begin that a machine
 IMPORTS = (ast.Import, ast.ImportFrom)
 HEAD = """# Gallery
 
-Each scene has a page with its code, what it prints, its figures, and commands to try. Its number is tested against a
-closed form or the source. `servoctl list` prints the names, `servoctl run NAME` runs a scene. Orders on these pages are
-those of the residuals as given, after a plus sign those of material constraints; no index is defined above order 2.
+Each scene has a page with what it teaches, its output, figures, code, and commands to try. It quotes one result, which is
+tested against a closed form or the cited source. `servoctl list` prints the names, `servoctl run NAME` runs a scene.
 """
-FACTS = """| orders | hidden constraints | index | free initial values |
+FACTS = """| orders of the residuals | hidden constraints | index | free initial values |
 |---|---|---|---|
 """
+LEGEND = "\nOrders of material constraints follow a plus sign; programs of order above 2 have no index. [Glossary](../glossary.md)\n"
 CODE = "```{{literalinclude}} ../../servoctl/gallery/{file}\n{part}\n```\n"
 BEGIN = """import servoctl as sv
 from servoctl.gallery import {function}
@@ -87,11 +87,11 @@ def scene_page(name):
         f"# {name}\n\n{scene.description}\n",
         f"![{scene.description}](../figures/gallery/{name}.png)\n",
         textwrap.fill(f"{scene.teaches} {scene.number} Source: {scene.source}.", WIDTH) + "\n",
-        f"{FACTS}| {' | '.join(facts(run.model))} |\n",
-        f"## Its code\n\n{code(scene)}",
-        f"## What it prints\n\n```python\n{written}```\n\n```text\n{printed}```\n",
+        f"{FACTS}| {' | '.join(facts(run.model))} |\n{LEGEND}",
+        f"## Output\n\n```python\n{written}```\n\n```text\n{printed}```\n",
         f"![Coordinates and forces over time](../figures/signals/{name}.png)\n",
-        f"## To try\n\n{commands(name, run)}",
+        f"## Code\n\n{code(scene)}",
+        f"## Try it\n\n{commands(name, run)}",
     ]
     return "\n".join(parts), run
 
