@@ -31,13 +31,15 @@ INERTIAS = ("m", "j", "density")  # how names of parameters begin that a machine
 IMPORTS = (ast.Import, ast.ImportFrom)
 HEAD = """# Gallery
 
-Each scene has a page with what it teaches, its output, figures, code, and commands to try. It quotes one result, which is
-tested against a closed form or the cited source. `servoctl list` prints the names, `servoctl run NAME` runs a scene.
+Each scene has a page with what it teaches, its output, figures, code, and commands to try. It quotes one result, which
+is tested against a closed form or the cited source. `servoctl list` prints the names, `servoctl run NAME` runs a scene.
 """
 FACTS = """| orders of the residuals | hidden constraints | index | free initial values |
 |---|---|---|---|
 """
-LEGEND = "\nOrders of material constraints follow a plus sign; programs of order above 2 have no index. [Glossary](../glossary.md)\n"
+LEGEND = """
+Orders of material constraints follow a plus sign; above order 2 no index is defined ([glossary](../glossary.md)).
+"""
 CODE = "```{{literalinclude}} ../../servoctl/gallery/{file}\n{part}\n```\n"
 BEGIN = """import servoctl as sv
 from servoctl.gallery import {function}
