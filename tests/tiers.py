@@ -21,7 +21,7 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent
 FOLDER = Path(os.environ.get("SERVOCTL_TIERS", Path(tempfile.gettempdir(), "tiers")))
-FIRST, SECOND = 300.0, 2200.0  # CPU s of the first two tiers, collecting left out
+FIRST, SECOND = 420.0, 2600.0  # CPU s of the first two tiers, collecting left out
 LEAST = 0.02  # CPU s that a case costs at least, in reports and fixtures
 
 
