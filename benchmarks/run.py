@@ -2,7 +2,7 @@
 
 import argparse
 import json
-from datetime import UTC, datetime
+from datetime import datetime, timezone
 from pathlib import Path
 
 import appell_hamel
@@ -89,7 +89,7 @@ def main():
     if arguments.rounds < 5:
         parser.error("a median needs at least 5 rounds")
     kept = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
-    measured, about = {}, {"machine": harness.machine(), "date": datetime.now(UTC).date().isoformat()}
+    measured, about = {}, {"machine": harness.machine(), "date": datetime.now(timezone.utc).date().isoformat()}
     for key in arguments.rows or ROWS:
         measured[key] = harness.measure(ROWS[key](), arguments.rounds) | about
         print(table({key: measured[key]}), flush=True)

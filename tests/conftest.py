@@ -187,8 +187,11 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     """What is named is run whole."""
-    given = [config.invocation_params.dir / argument for argument in config.args]
-    config.stash[TIER] = config.option.tier if given == [TESTS] else "all"
+    tier, folder = config.option.tier, config.invocation_params.dir
+    every = all(TESTS.is_relative_to(os.path.abspath(folder / argument)) for argument in config.args)
+    if not every and tier in ("second", "third"):
+        raise pytest.UsageError(f"--{tier} takes its tests from lists; a file or test that is named is run whole without it.")
+    config.stash[TIER] = tier if every else "all"
 
 
 def pytest_ignore_collect(collection_path, config):

@@ -38,7 +38,7 @@ _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
 _locks = {}  # key -> lock: no two threads compile the same text
 _guard = threading.Lock()
 _warned = False
-_repaid = contextvars.ContextVar("calls that repay compiling", default=0)
+_fewest = contextvars.ContextVar("fewest calls that are worth compiling", default=0)
 
 
 class _CompilerFailed(Exception):
@@ -47,17 +47,17 @@ class _CompilerFailed(Exception):
 
 @contextlib.contextmanager
 def once(calls):
-    """Compile a library that is not on disk only if so many calls of its functions are known: in commands that end."""
-    token = _repaid.set(calls)
+    """While this holds, a library that is not on disk is compiled only if so many calls of its functions are known."""
+    token = _fewest.set(calls)
     try:
         yield
     finally:
-        _repaid.reset(token)
+        _fewest.reset(token)
 
 
-def repaid(calls):
-    """Whether so many calls are worth compiling."""
-    return calls >= _repaid.get()
+def worth_compiling(calls):
+    """Whether so many calls are."""
+    return calls >= _fewest.get()
 
 
 def library(text, level="-O1", exact=False, calls=math.inf):
@@ -80,11 +80,11 @@ def library(text, level="-O1", exact=False, calls=math.inf):
     ctypes.CDLL or None
         None without a compiler, if compiling failed (one warning per process, unless none was chosen), or not yet.
     """
-    from servoctl.codegen.tables import bind  # imports NumPy and CasADi, which naming the compiler needs not
+    from servoctl.codegen.tables import bind  # imports NumPy and CasADi, which are not needed to name the compiler
 
     command, identity = _compiler()
     if command is None:
-        chosen = os.environ.get("SERVOCTL_COMPILER") == "none" or not repaid(calls)
+        chosen = os.environ.get("SERVOCTL_COMPILER") == "none" or not worth_compiling(calls)
         return None if chosen else _without("No C compiler was found")
     level, *tuning = level.split()
     flags = (level, *FLAGS, *(ROUNDED if exact else ())), (*_optional_flags(), *tuning)
@@ -95,7 +95,7 @@ def library(text, level="-O1", exact=False, calls=math.inf):
     with lock:
         if key not in _loaded:
             found = _open(cache_directory() / f"{key}.so")
-            if found is None and not repaid(calls):
+            if found is None and not worth_compiling(calls):
                 return None
             _loaded[key] = found or _build(text, flags, f"{key}.so", command)
             if _loaded[key] is not None:
@@ -115,7 +115,8 @@ def compiler_in_words():
 
     if (command := _compiler()[0]) is None:
         return "none"
-    version = subprocess.getoutput(shlex.join((*command, "--version"))).partition("\n")[0]
+    asked = subprocess.run((*command, "--version"), capture_output=True, text=True, timeout=PATIENCE_WITH_COMPILER)
+    version = asked.stdout.partition("\n")[0]
     return f"{' '.join(command)}: {version}, {' '.join((*FLAGS, *_optional_flags()))}"
 
 

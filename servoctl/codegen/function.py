@@ -159,7 +159,7 @@ class Compiled:
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self.others, self.sizes)
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
-        travels = self.loops and "_library" not in self.__dict__ and compiler.compiler() is not None
+        travels = self.loops and "_library" not in vars(self) and not self._too_long and compiler.compiler() is not None
         text = self.source() if travels else ""
         state = {"_text": None if not text or BOUND in text else text}
         return Compiled, parts, state | ({"operations": self.operations} if self.loops else {})
@@ -386,9 +386,14 @@ class Compiled:
             )
 
     @property
+    def _too_long(self):
+        """Whether compiling takes as long as all steps of a motion."""
+        return "taylor" in self.loops and self.operations > TAYLOR_COMPILED
+
+    @property
     def _library(self):
         """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
-        if "taylor" in self.loops and self.operations > TAYLOR_COMPILED:
+        if self._too_long:
             return self._interpreter
         return self._loaded("_library", self.source, self._level)
 
@@ -404,7 +409,7 @@ class Compiled:
         if name not in vars(self):
             text = source() if compiler.compiler() else ""
             library = compiler.library(text, level, calls=self._in_loops)
-            if library is None and not compiler.repaid(self._in_loops):
+            if library is None and not compiler.worth_compiling(self._in_loops):
                 return self._interpreter
             self._text, found = None, self._interpreter
             if library is not None:
@@ -420,10 +425,11 @@ class Compiled:
 
     def source(self):
         """C text of the library."""
-        if self._text is None:
-            parts = {"project": self._project, "others": self.others, "sizes": self.sizes}
-            self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide="newton" in self.loops)
-        return self._text
+        text = self._text
+        if text is None:
+            wide, parts = "newton" in self.loops, {"project": self._project, "others": self.others, "sizes": self.sizes}
+            text = self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide=wide)
+        return text
 
     def _place(self, evaluator, t, x, p):
         """Write t, x and p into an evaluator's workspace of this thread; return its y and its call."""

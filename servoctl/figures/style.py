@@ -53,11 +53,15 @@ def column():
             top = height - sum(PAD + text.get_window_extent(renderer).height / fig.dpi for text in titles)
             for text in titles:
                 text.set_y(1 - PAD / height)
-            above = np.array([PAD + TITLE * max(1, _title_lines(ax)) for ax in fig.axes])
+            rows = {ax: ax.get_subplotspec().rowspan.start for ax in fig.axes if ax.get_subplotspec()}
             shares = np.array(fig.axes[0].get_gridspec().get_height_ratios(), dtype=float)
+            above = np.full(len(shares), PAD + TITLE)
+            for ax, row in rows.items():
+                above[row] = max(above[row], PAD + TITLE * _title_lines(ax))
             up = shares / shares.sum() * (top - above.sum() - BELOW)
-            for ax, low, tall in zip(fig.axes, top - np.cumsum(above + up), up, strict=True):
-                ax.set_position([left / width, low / height, across / width, tall / height])
+            low = top - np.cumsum(above + up)
+            for ax, row in rows.items():
+                ax.set_position([left / width, low[row] / height, across / width, up[row] / height])
                 ax.set_in_layout(True)  # which `set_position` ends
                 if ax.get_aspect() == "auto":
                     ax.yaxis.set_label_coords(-LABEL / across, 0.5)

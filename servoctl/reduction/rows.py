@@ -189,9 +189,9 @@ def _refuse_square(q, row, context, slopes=None):
     z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
     end = replace(start, z=z)
     before, after = (np.abs(points.matrix(gradient)[0]).max(axis=(0, 1)) for points in (start, end))
-    # So does one that changes by its own size as far as the rounding of the row's terms moves the solution.
+    # A gradient also vanishes if it changes by its own size where rounding of the row's terms moves the solution.
     way, left = np.abs(z - start.z).max(axis=0), ROUNDED * values_and_sizes(row, end)[1][0]
-    vanished, solved = (after < VANISHED * before) | (after**2 * way < left * before), residual < SOLVED
+    vanished, solved = (after < VANISHED * before) | ((way > 0) & (after**2 * way < left * before)), residual < SOLVED
     if solved.any() and vanished[solved].all():
         if not _regular_nearby(flow, row, end.take(np.flatnonzero(solved))):
             raise vanishing_gradient(q, row, context, _repeated(factors(row.expression)))

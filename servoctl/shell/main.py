@@ -41,10 +41,11 @@ def main(argv=None):
     if left:
         args.parser.error(f"unrecognized argument {left[0]!r}" + _option_like(left[0], args.parser.format_help()))
     args.command_line = argv
-    warnings.formatwarning = lambda message, *_: f"{message}\n"  # one line, without places in the sources
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a run must not fail because a terminal has no Greek letters
+    shown = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_: f"{message}\n"  # one line, without places in the sources
     try:
         return args.command(args)
     except ServoError as error:
@@ -53,6 +54,8 @@ def main(argv=None):
     except KeyboardInterrupt:
         complain("Interrupted; files that were already written are kept.")
         return 130
+    finally:
+        warnings.formatwarning = shown
 
 
 class _Parser(argparse.ArgumentParser):
@@ -62,7 +65,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _option_like(given, text):
-    """The option or the command in a help's text that is nearest to a given one."""
+    """The option in a help's text that is nearest to a given one."""
     match = unknown(given.partition("=")[0], re.findall(r"(?<!\S)--[\w-]+", text), "option").details["match"]
     return f"; nearest: {match}" if match else ""
 
