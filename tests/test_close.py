@@ -200,7 +200,7 @@ def test_measurements_are_the_states_that_a_law_measures(crane_plan, make, senso
     monkeypatch.setattr(sampled, "PIECE", 1e-9)
     paused = sv.close(plant, law, x0, (0.0, 1.0), sensors=sensors)
     assert np.array_equal(paused.states, run.states) and np.array_equal(paused.measurements, run.measurements)
-    monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, suffix: None)
+    monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, *_: None)
     interpreted = sv.close(plant, law, x0, (0.0, 1.0), sensors=sensors)
     assert interpreted.states == pytest.approx(run.states, abs=1e-10)
 
@@ -209,7 +209,7 @@ def test_measurements_are_the_states_that_a_law_measures(crane_plan, make, senso
 def test_measurements_and_states_are_not_changed(is_compiled, monkeypatch):
     plant = sv.plant(POINT)
     if not is_compiled:
-        monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, suffix: None)
+        monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, *_: None)
     run = sv.close(plant, lambda t, y: [-y["x"] - y["dx"]], [1.0, 0.5], (0.0, 1.0), timing=sv.Timing(rate=20.0))
     assert np.array_equal(run.measurements, run.states)
     for array in (run.measurements, run.states):  # which may be one
@@ -261,7 +261,7 @@ def test_the_loop_without_a_compiler_is_the_same(crane_plan, monkeypatch):
     plant, x0, span, options = conditions(crane_plan)
     law = sv.lqr(crane_plan, sv.plant(CRANE), integral=True)
     a = sv.close(plant, law, x0, span, **options)
-    monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, suffix: None)
+    monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, *_: None)
     b = sv.close(plant, law, x0, span, **options)
     assert b.states == pytest.approx(a.states, rel=1e-9, abs=1e-11)
     assert b.inputs == pytest.approx(a.inputs, rel=1e-9, abs=1e-9)

@@ -177,7 +177,7 @@ def test_the_motion_before_a_limit_that_cannot_be_kept_is_in_the_error(crane, mo
     plant = sv.plant(mechanism)
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, suffix: None)
+            monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, *_: None)
         with pytest.raises(sv.LimitExceeded) as caught:
             sv.close(plant, Failing(), plan.state(0.0), (0.0, 1.0), timing=sv.Timing(rate=100.0))
         run = caught.value.run

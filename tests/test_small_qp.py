@@ -119,7 +119,7 @@ def test_compiled_allocations_are_those_in_python(plan, monkeypatch):
     for name, law, given in laws(plan, machine):
         limited = sv.limited(law, machine, **given)
         runs = []
-        for native in (limits.Allocation.native, lambda self, suffix: None):
+        for native in (limits.Allocation.native, lambda self, *_: None):
             monkeypatch.setattr(limits.Allocation, "native", native)
             runs.append(sv.close(machine, limited, plan.state(0.0), (0.0, 5.0)))
         monkeypatch.undo()

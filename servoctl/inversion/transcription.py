@@ -210,7 +210,7 @@ class Transcription:
     @cached_property
     def _problem(self):
         """Variables, weights, the objective, and the constraints by kind."""
-        from scipy.sparse import block_diag
+        from scipy.sparse import block_diag, coo_matrix
 
         node, mesh, K, s = self.node, self.mesh, self.count, len(self.mesh.c)
         count = self.n * (1 + K) + self.m * (1 + len(self.pieces.nodes))
@@ -220,7 +220,7 @@ class Transcription:
         v = ca.vertcat(*(points @ _matrix(_at(self.pieces, mesh.nodes, k)) for k in range(node.depth + 1)))
         rates, residuals, effort = f(ca.DM(mesh.nodes).T, x[:, 1:], v)
         begins = np.repeat(np.arange(0, K, s), s).tolist()
-        increments = (x[:, 1:] - x[:, begins]) @ _matrix(block_diag([radau(mesh.order)[1].T] * len(mesh.h)))
+        increments = (x[:, 1:] - x[:, begins]) @ _matrix(block_diag([coo_matrix(radau(mesh.order)[1].T)] * len(mesh.h)))
         h = ca.repmat(ca.DM(np.repeat(mesh.h, s)).T, self.n, 1)
         cost = ca.sum1(residuals**2 / ca.repmat(beta, 1, K)) + effort
         scale = self.sizes[3] * np.sum(mesh.h)
