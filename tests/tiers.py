@@ -4,9 +4,10 @@
     python tests/tiers.py arcs      what the first case of each function executes, by coverage
     python tests/tiers.py write     the lists: tests/left.txt, tests/by_hand.txt
 
-Further arguments are pytest's. Measurements are added to a folder, by default `tiers` in the system's folder for temporary files. A test that was
-skipped in any of them, such as for an extra that is not installed, is in no first tier. The first two tiers
-have what executes most new arcs of the package per second, until their time is spent; a case counts as an arc.
+Further arguments are pytest's. Measurements are added to a folder, by default `tiers` in the system's folder for
+temporary files; empty it before a new start. A test that was skipped in any of them, such as for an extra that is not
+installed, is in no first tier. The first two tiers have what executes most new arcs of the package per second, until
+their time is spent; a case counts as an arc.
 """
 
 import argparse
