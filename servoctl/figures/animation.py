@@ -23,6 +23,7 @@ MOST_FRAMES = 500  # of an animation: longer motions are shown faster
 SLOWED = 2.0  # s that an animation lasts at least: shorter motions are shown slower
 PATH_POINTS = 400  # of a drawn path
 STILL = 1e-9  # change of a shape over the motion below which it is the ground, relative to the picture
+LETTER = 0.1  # inches: of a title, which the picture is no narrower than
 BORDER = 0.06  # around the motion, of the picture's larger side
 ACROSS, UP = 6.4, 5.6  # inches, of the picture's plane
 TRIAD, ARROW = (0.32, 0.15), 0.33  # place and length of the directions of space [inches]
@@ -465,7 +466,7 @@ def _axes(picture, ax, title=""):
     low, high = _corners(picture)
     across, up = (high - low) * min(ACROSS / (high - low)[0], UP / (high - low)[1])
     if ax is None:
-        _, ((ax,),) = style.figure(up + 0.6 + 0.35 * bool(title), width=across + 0.7)
+        _, ((ax,),) = style.figure(up + 0.6 + 0.35 * bool(title), width=max(across + 0.7, style.LEFT + LETTER * len(title)))
     ax = style.as_single_axes(ax, up)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     if title:
