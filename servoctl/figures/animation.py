@@ -466,7 +466,8 @@ def _axes(picture, ax, title=""):
     low, high = _corners(picture)
     across, up = (high - low) * min(ACROSS / (high - low)[0], UP / (high - low)[1])
     if ax is None:
-        _, ((ax,),) = style.figure(up + 0.6 + 0.35 * bool(title), width=max(across + 0.7, style.LEFT + LETTER * len(title)))
+        width = max(across + 0.7, style.LEFT + LETTER * len(title))
+        _, ((ax,),) = style.figure(up + 0.6 + 0.35 * bool(title), width=width)
     ax = style.as_single_axes(ax, up)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     if title:
