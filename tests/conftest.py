@@ -119,6 +119,9 @@ def pendulum(unit=1.0, guess=True):
     return sv.derive(mechanism, program, guess={"y": -unit} if guess else {}, keep=["x", "y"])
 
 
+lean = pytest.mark.skipif(not hasattr(ca.GlobalOptions, "getNumpyMode"), reason="CasADi before 3.8 merges fewer operations")
+
+
 def needs(module):
     """A module of an extra, or a skip that says which one."""
     return pytest.importorskip(module, reason=f"needs {module}, which is in the extra 'test-all'")

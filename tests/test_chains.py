@@ -7,6 +7,7 @@ import re
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import lean
 
 import servoctl as sv
 from servoctl import gallery
@@ -15,6 +16,9 @@ from servoctl.codegen.chains import short_chains, time_of
 from servoctl.codegen.collecting import ways
 from servoctl.codegen.compiler import library
 from servoctl.jets.pieces import Constant
+from servoctl.tolerances import EXTENDED
+
+extended = pytest.mark.skipif(not EXTENDED, reason="what is compared with is computed in extended precision")
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 4), ca.SX.sym("p", 3)
 SINE, COSINE = ca.sin(X[0]), ca.cos(X[0])
@@ -131,6 +135,7 @@ def test_rates_of_plants_have_shorter_chains_and_the_same_values(scene):
         np.testing.assert_allclose(evaluate(0.3, x, p), exact, rtol=0, atol=1e-12 * np.abs(exact).max())
 
 
+@lean
 def test_the_chain_of_the_crane_is_two_thirds():
     f = sv.plant(gallery.overhead_crane()[0]).function("ode").expression
     assert (chain(statements(f, chained=False)), chain(statements(f))) == (18, 12)
@@ -217,6 +222,7 @@ def evaluated(given, t, x, p):
     return np.array([outputs[i] for i in range(len(outputs))])
 
 
+@extended
 @pytest.mark.parametrize("scene", (*SCENES, "planar_arm", "trailers", "bicycle", "four_bar"))
 def test_collected_rates_are_as_accurate_in_all_units(scene):
     """Against extended precision, with states and parameters of all sizes."""
@@ -235,6 +241,7 @@ def test_collected_rates_are_as_accurate_in_all_units(scene):
         assert own <= 2 * reference + np.finfo(float).eps
 
 
+@extended
 @np.errstate(all="ignore")
 @pytest.mark.parametrize("scene", ("overhead-crane", "crane-3d", "vtol", "slung-load", "rotary-crane", "three-cars", "beam-crane"))
 def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):

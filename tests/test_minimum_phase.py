@@ -353,7 +353,7 @@ def test_bad_input(arm):
 
 
 def test_states_that_are_no_equilibria_are_refused(arm):
-    with refused(sv.InconsistentStart, "q2 = 0", t=0.0) as caught:
+    with refused(sv.InconsistentStart, "q2", t=0.0) as caught:
         sv.minimum_phase(arm, "Gamma", (0, 1), at=arm.start(q2=0.3))
     assert caught.value.details["equilibrium"]["q2"] == pytest.approx(0.0, abs=1e-12)
     with refused(sv.InconsistentStart, t=0.0):

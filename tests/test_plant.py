@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import lean
 from refusals import refused
 
 import servoctl as sv
@@ -232,6 +233,7 @@ def test_gathered_powers_of_two_change_no_bit(name):
         assert np.array_equal(np.array(f(*point)), np.array(g(*point)), equal_nan=True)
 
 
+@lean
 def test_the_crane_takes_few_operations():
     assert sv.plant(RELATIVE).function("ode").operations <= 75
 

@@ -5,6 +5,8 @@ the time T itself are chosen so that log c is as equal as can be within each row
 & Reid, J. Inst. Maths Applics 10 (1972) 118-124, with γ^(k) scaled by s_w / T^k).
 """
 
+from math import log
+
 import casadi as ca
 import numpy as np
 
@@ -13,7 +15,7 @@ from servoctl.values import frozen
 ORDINARY = 100.0  # factor from 1 within which sizes of jets and of the time are taken as 1
 WEAK = 0.3  # weight of the size 1 beside that of a term; a guessed size has the weight of a term
 ROUNDS = 12  # of evaluation and least squares; each goes half the way, which converges for rows of any degree up to 3
-ALIKE = np.log(3.0)  # change of a logarithm at which the rounds end
+ALIKE = log(3.0)  # change of a logarithm at which the rounds end
 FELT = 1e-9  # a change below this fraction of the row is its rounding
 SCALES_SEED = 1972
 TERM_POINTS = 3  # points at which terms are compared

@@ -75,11 +75,10 @@ class Kinematics:
         i = len(self.omega)
         outer, speed = self.parent(self.omega, i), self.parent(self.speed, i)
         carried = self.into(i, speed + ca.cross(outer, self.arm(i)))
-        spin, slide = {
-            "turn": (along_z(axis.rate[0]), 0),
-            "slide": (0, along_z(axis.rate[0])),
-            "free": (axis.rate[3:], axis.rate[:3]),
-        }[body.motion]
+        if body.motion == "free":
+            spin, slide = axis.rate[3:], axis.rate[:3]
+        else:
+            spin, slide = (along_z(axis.rate[0]) if body.motion == kind else 0 for kind in ("turn", "slide"))
         self.omega.append(self.into(i, outer) + spin)
         self.speed.append(carried + slide)
 
@@ -164,7 +163,9 @@ def _local(axis, first):
 
 def _carried(axis):
     """Offset of a body in the frame of its placement."""
-    return {"turn": ca.SX.zeros(3), "slide": along_z(axis.value[0]), "free": axis.value[:3]}[axis.motion]
+    if axis.motion == "free":
+        return axis.value[:3]
+    return along_z(axis.value[0]) if axis.motion == "slide" else ca.SX.zeros(3)
 
 
 def along_z(value):
