@@ -97,7 +97,7 @@ def read(path, what, build):
     path = as_path(path, f"The path of the {what}")
     try:
         path = path if path.is_file() else _suffixed(path)
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:  # NumPy leaves damaged ones open
             facts = json.loads(str(data["meta"]))
             require(facts["format"] == FORMAT, f"its format is {facts['format']!r}, not {FORMAT}")
             return build(facts, data)
