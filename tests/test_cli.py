@@ -1,5 +1,6 @@
 """The command line: what it leaves, what it says, and that nothing computed is lost."""
 
+import io
 import json
 import os
 import platform
@@ -637,3 +638,12 @@ def test_options_beyond_their_bounds_are_refused(argv, capsys):
 def test_a_delay_beyond_its_bound_is_a_sentence(delay, capsys):
     assert main(["run", "overhead-crane", "--no-figures", "--law", "computed", "--delay", delay]) in (1, 2)
     assert "delay" in capsys.readouterr().out
+
+
+def test_a_reader_that_stops_reading_is_no_error(monkeypatch):
+    class Closed(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError
+
+    monkeypatch.setattr(sys, "stdout", Closed())
+    assert main(["versions"]) == 0

@@ -1,6 +1,7 @@
 """The command line: its parser. The module of a command is imported when it is the one that is given."""
 
 import argparse
+import os
 import re
 import sys
 import warnings
@@ -51,6 +52,9 @@ def main(argv=None):
     except ServoError as error:
         complain(f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ()))
         return 2
+    except BrokenPipeError:  # of a reader that stops reading, such as head
+        sys.stdout = open(os.devnull, "w")
+        return 0
     except KeyboardInterrupt:
         complain("Interrupted; files that were already written are kept.")
         return 130
