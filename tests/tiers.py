@@ -22,7 +22,7 @@ from pathlib import Path
 
 TESTS = Path(__file__).parent
 FOLDER = Path(os.environ.get("SERVOCTL_TIERS", Path(tempfile.gettempdir(), "tiers")))
-FIRST, SECOND = 250.0, 1300.0  # CPU s of the first two tiers, collecting left out
+FIRST, SECOND = 250.0, 1000.0  # CPU s of the first two tiers, collecting left out
 LEAST = 0.02  # CPU s that a case costs at least, in reports and fixtures
 
 
