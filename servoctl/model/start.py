@@ -11,6 +11,7 @@ from servoctl.checks import column, finite, mapping
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, unknown
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
+from servoctl.model.rests import Rests
 from servoctl.spec.mechanism import require_known
 from servoctl.values import Value, frozen
 
@@ -30,6 +31,7 @@ SEARCH_STEPS = 20  # of Newton's method from each
 NEARER = 0.25  # of the way from one such state to another: a reference before it is clearly nearer the first
 DISTINCT = 1e-3  # difference of two such states, relative to their size
 SHOWN = 3  # values by which a printed state tells branches apart
+STILL = 1e-6  # largest rate of a state at rest, relative to its size
 PRINTED_ZERO = 1e-14  # of the largest value: a smaller one that is not held is printed as zero
 
 
@@ -114,7 +116,7 @@ class JetEquations:
         else:
             extended = Invariants(r.mechanism, rows or r.rows, top, r.points)
             self.f, names = _numeric(extended.invariants()), [name for _, name, _ in extended.invariant_rows]
-        self.invariants, self.rows, self.conditions = len(names), [*names, *conditions], None
+        self.invariants, self.rows, self.conditions, self.kept = len(names), [*names, *conditions], None, slice(None)
         self.names = model.names_to(q.nq + (top - 1) * q.n)
         if conditions:
             jets, values = ca.vertcat(*(q.jet(k) for k in range(top))), ca.vertcat(*conditions.values())
@@ -127,18 +129,20 @@ class JetEquations:
         with np.errstate(all="ignore"):
             parts = [self._split(self.f(self.t, x, self.p), self.invariants, x)]
             if self.conditions is not None:
-                parts.append(self._split(self.conditions(self.t, x, self.p), len(self.rows) - self.invariants, x))
-        return tuple(map(np.concatenate, zip(*parts, strict=True)))
+                values = self.conditions(self.t, x, self.p)
+                parts.append(self._split(values, len(values) // (1 + len(x)), x))
+        value, jacobian = map(np.concatenate, zip(*parts, strict=True))
+        return value[self.kept], jacobian[self.kept]
 
     @staticmethod
     def _split(y, m, x):
         return y[:m], y[m:].reshape(len(x), m).T
 
-    def without_conditions(self):
-        """The invariants alone, of the same jets."""
-        alone = copy(self)
-        alone.rows, alone.conditions = self.rows[: self.invariants], None
-        return alone
+    def without(self, names):
+        """The equations, of the same jets, but for some by name."""
+        others, left = copy(self), [a for a, row in enumerate(self.rows) if row not in names]
+        others.rows, others.kept = [self.rows[a] for a in left], left
+        return others
 
     def scaled(self, x):
         """Residuals relative to the size of their gradients times that of the jets."""
@@ -183,15 +187,35 @@ def consistent(model, t, held, guess, hold):
     chosen = guess | values
     names = JetEquations(model, t, conditions).names
     aim = Aim.of(names, guess, values)
-    equations, x, residual = _solve(model, t, aim, conditions)
-    if not residual < TOLERANCE:
-        _refuse(equations, aim, dict.fromkeys(conditions, 0.0) | held, x)
-    free = free_names(equations, x, aim, chosen)
-    x, residual = _at_guess(equations, x, residual, aim, [name in free and name in chosen for name in names])
-    sought = aim.movable & [name not in free for name in names]
-    branches = _branches(equations, x, replace(aim, movable=sought), model)
-    fixed, left = tuple(dict.fromkeys((*held, *conditions))), tuple(name for name in free if name in states)
-    return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x])
+    equations, branches = _rests(model, t, aim, values, conditions) or _solved(model, t, aim, conditions, held)
+    x, fixed = branches[0], tuple(dict.fromkeys((*held, *conditions)))
+    left = tuple(name for name in free_names(equations, x, aim, chosen) if name in states)
+    return State(t, x[:n_x], states, fixed, left, _largest(equations, x), branches=branches[:, :n_x])
+
+
+def _rests(model, t, aim, held, conditions):
+    """The equations, and the rest nearest to the guess before others like it, where a path begins at rest; else None."""
+    q, residuals = model.reduction.mechanism.q, model.reduction.program.residuals.values()
+    rates = held.keys() - set(q.names)
+    if not any(ca.depends_on(e, q.t) for e in residuals) or any(held[name] for name in rates):
+        return None
+    equations, rests = JetEquations(model, t, conditions), model.once("rests", lambda: Rests.of_model(model))
+    chosen = zip(q.names, aim.reference, (aim.weights > 1.0) | ~aim.movable, strict=False)
+    guess = {name: value for name, value, known in chosen if known}
+    found, _ = rests.nearest(t, model.parameters, guess, held.keys() - rates)
+    states = [np.concatenate([z[: q.nq], np.zeros(len(equations.names) - q.nq)]) for z in found]
+    states = [x for x in states if _largest(equations, x) < TOLERANCE and _stays(model, t, x)]
+    others = [x for x in states[1:] if not _clear_choice(states[0], x, aim, model)]
+    return (equations, np.array([states[0], *others])) if states else None
+
+
+def _stays(model, t, x):
+    """Whether a state stays from t on or, as where a path begins with a jump, did before; so it does where singular."""
+    if model.flat:
+        return True
+    f, n_x = model.function("ode").expression, len(model.state_names)
+    rates = (np.abs(f(at, x[:n_x], model.parameters).full()[:n_x]).max() for at in (t, np.nextafter(t, -np.inf)))
+    return any(not rate > STILL * (1.0 + np.abs(x).max()) for rate in rates)
 
 
 def _split_held(model, held, hold):
@@ -253,6 +277,19 @@ def _solve(model, t, aim, conditions):
     return equations, x, residual
 
 
+def _solved(model, t, aim, conditions, held):
+    """The equations, and the state nearest to the guess before others that the guess excludes no better."""
+    equations, x, residual = _solve(model, t, aim, conditions)
+    if not residual < TOLERANCE:
+        _refuse(equations, aim, conditions, dict.fromkeys(conditions, 0.0) | held, x)
+    guessed = aim.weights > 1.0
+    chosen = np.where(guessed | ~aim.movable)[0]
+    free = free_names(equations, x, aim, {aim.names[i] for i in chosen})
+    x = _at_guess(equations, x, aim, guessed & np.isin(aim.names, free))
+    sought = aim.movable & ~np.isin(aim.names, free)
+    return equations, _branches(equations, x, replace(aim, movable=sought), model)
+
+
 def _by_blocks(model, t, equations, aim):
     """The start that Newton's method reaches from the reference block by block, then on all rows together."""
     r, q, n_x = model.reduction, model.reduction.mechanism.q, len(model.state_names)
@@ -265,36 +302,40 @@ def _by_blocks(model, t, equations, aim):
     return x, _largest(equations, x)
 
 
-def _at_guess(equations, x, residual, aim, guessed):
-    """The start with free values exactly as guessed, if that is consistent."""
-    guessed = np.array(guessed)
-    if not guessed.any():
-        return x, residual
-    moved = gauss_newton(equations, np.where(guessed, aim.reference, x), replace(aim, movable=aim.movable & ~guessed))
-    residual_there = np.abs(equations.scaled(moved)).max(initial=0.0)
-    return (moved, float(residual_there)) if residual_there < TOLERANCE else (x, residual)
+def _at_guess(equations, x, aim, guessed):
+    """A consistent state with all guessed values, else with those (n_z,) among them that are free, else x."""
+    for kept in (aim.weights > 1.0, guessed):
+        first = np.where(kept, aim.reference, x)
+        moved = gauss_newton(equations, first, replace(aim, movable=aim.movable & ~kept)) if kept.any() else x
+        if _largest(equations, moved) < TOLERANCE:
+            return moved
+    return x
 
 
-def _starts(aim):
-    """The reference, then points farther and farther from it."""
+def _starts(equations, aim, *others):
+    """The reference, the nearest state with all guessed values, others, then points farther from the reference."""
     yield aim.reference
+    guessed = aim.movable & (aim.weights > 1.0)
+    if guessed.any():
+        yield gauss_newton(equations, aim.reference, replace(aim, movable=aim.movable & ~guessed))
+    yield from others
     spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.sqrt(aim.weights)
     rng = np.random.default_rng(SEED)
     for attempt in range(1, TRIES):
         yield aim.reference + attempt * FARTHER * rng.uniform(-1.0, 1.0, len(spread)) * spread
 
 
-def _best(equations, aim):
-    """The projection of the reference onto the solutions; if it fails, from perturbed points."""
-    best, smallest = aim.reference, np.inf
-    for first in _starts(aim):
+def _best(equations, aim, *others):
+    """The solution nearest to the guess and then to the reference, from two points, from others if it fails."""
+    found, guessed = [], aim.weights > 1.0
+    for attempt, first in enumerate(_starts(equations, aim, *others)):
         x = _nearest(equations, gauss_newton(equations, first, aim), aim)
-        residual = _largest(equations, x)
-        if residual < smallest:
-            best, smallest = x, residual
-        if smallest < TOLERANCE:
+        residual, away = _largest(equations, x), np.linalg.norm((x - aim.reference)[guessed])
+        found.append((0 if residual < TOLERANCE else residual, away, attempt, x))
+        if attempt >= guessed.any() and min(found)[0] == 0:
             break
-    return best, smallest
+    best = min(found)[-1]
+    return best, _largest(equations, best)
 
 
 def _step(value, jacobian, aim):
@@ -351,7 +392,7 @@ def _nearest(equations, x, aim, iterations=40):
             trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
         trial = gauss_newton(equations, trial, aim, 12)
         distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
-        if np.abs(equations.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
+        if not (_largest(equations, trial) < TOLERANCE and distance < before * (1 - 1e-12)):
             break
         x = trial
     return x
@@ -389,19 +430,21 @@ def _branches(equations, x, aim, model):
         same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
         if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
             found.append(y)
-    return np.array(found)
+    away = [np.linalg.norm((y - aim.reference)[aim.weights > 1.0]) for y in found]
+    return np.array([found[i] for i in np.argsort(np.round(away, 9), kind="stable")])
 
 
 def _clear_choice(x, y, aim, model):
-    """Whether a guessed value tells two states apart, or the reference is much nearer the first of them.
+    """Whether the guess is much nearer the first of two states, or, without one, the reference is.
 
-    Nearness is judged by the lowest derivatives in which they differ.
+    Of the reference the lowest derivatives in which they differ count.
     """
     differ = np.abs(y - x) > DISTINCT * (1.0 + np.abs(x))
     levels = np.maximum(0, np.arange(len(x)) - model.nq + model.n) // model.n
-    lowest = differ & (levels == levels[differ].min())
+    guessed = differ & (aim.weights > 1.0)
+    lowest = guessed if guessed.any() else differ & (levels == levels[differ].min())
     between, way = (y - x)[lowest], (aim.reference - x)[lowest]
-    return bool(np.any(differ & (aim.weights > 1.0)) or way @ between < NEARER * (between @ between))
+    return bool(way @ between < NEARER * (between @ between))
 
 
 def _same_motion(x, y, model):
@@ -415,35 +458,43 @@ def _same_motion(x, y, model):
     return opposite or bool(np.all(np.abs(turned) <= small[:nq]))
 
 
-def _refuse(equations, aim, held, x):
+def _refuse(equations, aim, conditions, held, x):
     """Raise InconsistentStart: a held value contradicts an equation, or no state satisfies one."""
     residuals = np.abs(equations.scaled(x))
-    alone, all_movable = equations.without_conditions(), replace(aim, movable=np.ones(len(aim.names), dtype=bool))
-    loosened, residual = _best(alone, all_movable)
-    if not residual < TOLERANCE:
-        loosened = gauss_newton(alone, x, all_movable)
-        residual = np.abs(alone.scaled(loosened)).max(initial=0.0)
-    if held and residual < TOLERANCE:
-        left = dict(zip(equations.rows, equations(loosened)[0], strict=True))
-        states = dict(zip(aim.names, loosened, strict=True))
-        moved = {name: float(states[name] if name in states else held[name] + left[name]) for name in held}
-        moved = {name: value if abs(value) > TOLERANCE * abs(held[name]) else 0.0 for name, value in moved.items()}
-        change = max(moved, key=lambda n: abs(moved[n] - held[n]) / (1.0 + abs(held[n])))
+    alone, all_movable = equations.without(conditions), replace(aim, movable=np.ones(len(aim.names), dtype=bool))
+    if held and _best(alone, all_movable, x)[1] < TOLERANCE:
+        change, nearest = _nearest_held(equations, aim, held, x)
         largest, worst = max(zip(residuals, equations.rows, strict=True))
         by_others = "the constraints together with the other held values"
         what = f"the invariant {worst!r} (residual {largest:.2e})" if worst in alone.rows else by_others
         raise InconsistentStart(
             f"{change} = {held[change]:g} contradicts {what}.",
             "Held values satisfy every constraint and its time derivatives.",
-            nearest=f"{change} = {moved[change]:.9g}.",
-            do=f"Hold fewer values{', or pass this one in guess={...}' if change in states else ''}.",
+            nearest="" if nearest is None else f"{change} = {nearest:.9g}, beside the others.",
+            do=f"Hold fewer values{', or pass this one in guess={...}' if change in aim.names else ''}.",
             held=change,
             value=float(held[change]),
             invariant=worst,
             residual=float(largest),
-            nearest_value=moved[change],
+            nearest_value=nearest,
         )
     raise _not_found(equations, x, residuals)
+
+
+def _nearest_held(equations, aim, held, x):
+    """The held value whose least relative change agrees with the others, and that value, None where none does."""
+    change, nearest, least = next(iter(held)), None, np.inf
+    for name, value in held.items():
+        loose = replace(aim, movable=aim.movable | np.isin(aim.names, name))
+        y, residual = _best(equations.without([name]), loose, x)
+        if not residual < TOLERANCE:
+            continue
+        is_state = name in aim.names
+        other = y[aim.names.index(name)] if is_state else value + equations(y)[0][equations.rows.index(name)]
+        if abs(other - value) / (1.0 + abs(value)) < least:
+            change, least = name, abs(other - value) / (1.0 + abs(value))
+            nearest = float(other) if abs(other) > TOLERANCE * abs(value) else 0.0
+    return change, nearest
 
 
 def _not_found(equations, x, residuals):

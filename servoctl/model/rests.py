@@ -1,0 +1,188 @@
+"""Where a machine stands still under a program: one search, whoever asks for it.
+
+At rest γ' = γ'' = ... = 0, and ψ(t, q, μ) = [r - B μ; constraints; residuals] vanishes with forces μ that hold the
+machine. The search begins where the actuators alone bring the machine from its guess to the program, and at other
+angles. Distances are those of the kinetic energy. Of several rests the one nearest to the guess is taken; then the one
+with the smallest angles, as the zero of a length means nothing; then the one in which the machine hangs lowest.
+"""
+
+import casadi as ca
+import numpy as np
+
+from servoctl.reduction.rows import Row
+from servoctl.tolerances import TINY
+
+NEWTON = 25  # steps
+AT_REST = 1e-9  # largest row at a rest, relative to its slopes times the state
+RANK = 1e-8  # singular values below this fraction of the largest count as zero
+ALIKE = 1e-3  # difference of two rests, or of their distances relative to these, that decides nothing
+GUESSED = 1e3  # weight of a guessed value relative to one without a guess
+SEED = 1788  # of the point at which angles are told apart
+
+
+class Rests:
+    """The rests of a mechanism under a balance r (n,), directions B of what holds it, and rows by name.
+
+    p are the numbers of the mechanism's parameters, z = [q; μ].
+    """
+
+    def __init__(self, mechanism, balance, B, rows):
+        q = mechanism.q
+        self.coordinates, self.nq, self.n = q.names, q.nq, q.n
+        self.names = (*(f"balance of {name}" for name in q.force_names), *rows)
+        mu, p, self.angles = ca.SX.sym("mu", B.shape[1]), ca.vertcat(*mechanism.parameters.symbols), None
+        z = ca.vertcat(q.jet(0), mu)
+        still = _still(q, ca.vertcat(balance - B @ mu, *rows.values()))
+        moving = {f"rate of {name}": h for name, h in zip(q.names, q.h.elements(), strict=True) if not h.is_zero()}
+        rows = ca.vertcat(still, *q.invariants.values(), *moving.values())
+        self.names += (*q.invariants, *moving)
+        self.function = ca.Function("rest", [q.t, z, p], [ca.densify(rows), ca.densify(ca.jacobian(rows, z))])
+        frame = [ca.densify(_still(q, e)) for e in (ca.SX(q.V), mechanism.mass, mechanism.E)]
+        self._frame = ca.Function("frame", [q.t, q.jet(0), p], frame)
+
+    @classmethod
+    def of_model(cls, model):
+        """Those under the balance and the actuation of a model."""
+        r = model.reduction
+        return cls(r.mechanism, r.balance, r.realisation.B, {row.name: row.expression for row in r.original.values()})
+
+    @classmethod
+    def of_program(cls, mechanism, forces, program):
+        """Those with any actuation, under further forces (n,), of rows that can hold at rest."""
+        q, material = mechanism.q, mechanism.constraints
+        B = ca.horzcat(mechanism.E, *(Row(e, max(q.order(e), 0), name, "material").gradient(q).T
+                                      for name, e in material.items()))  # fmt: skip
+        return cls(mechanism, mechanism.balance - forces, B, {**material, **program.residuals})
+
+    def measured(self, t, z, p):
+        """The rows (e,) at [q; μ], their slopes (e, z) and the rows relative to these and to the state."""
+        rows, slopes = (np.array(part) for part in self.function(t, z, p))
+        return rows[:, 0], slopes, np.abs(rows[:, 0]) / np.maximum(np.abs(slopes) @ (1.0 + np.abs(z)), TINY)
+
+    def reached(self, t, p, q, movable=None, weights=None, some=slice(None)):
+        """[q; μ] nearest to a rest that Newton's method finds by least weighted steps, whether it is one, the worst row.
+
+        Only some coordinates are movable, and only some rows need to vanish.
+        """
+        movable, weights = np.ones(self.nq, bool) if movable is None else movable, 1.0 if weights is None else weights
+        z, weights = np.concatenate([q, np.zeros(self.function.size1_in(1) - self.nq)]), weights * np.ones(self.nq)
+        best, least = z, np.inf
+        for _ in range(NEWTON):
+            rows, slopes, off = (part[some] for part in self.measured(t, z, p))
+            largest = float(np.nan_to_num(off, nan=np.inf).max(initial=0.0))
+            if not np.isfinite(slopes).all() or largest >= least <= AT_REST:
+                break
+            best, least = (z, largest) if largest < least else (best, least)
+            z = z + self._step(rows, slopes, movable, weights)
+        rows, _, off = (part[some] for part in self.measured(t, best, p))
+        worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
+        return best, least <= AT_REST, (self.names[np.arange(len(self.names))[some][worst]], float(rows[worst]))
+
+    def _step(self, rows, slopes, movable, weights):
+        """The least weighted step of the coordinates that the rows ask for, whatever the forces, and these forces."""
+        sizes = np.maximum(np.abs(slopes).max(axis=1), TINY)[:, None]
+        of_q, of_mu = np.split(slopes / sizes, [self.nq], axis=1)
+        left, singular, _ = np.linalg.svd(of_mu)
+        unforced = left[:, np.sum(singular > RANK * singular.max(initial=0.0)) :].T
+        step, right = np.zeros(slopes.shape[1]), -rows / sizes[:, 0]
+        columns = (unforced @ of_q)[:, movable] / weights[movable]
+        step[: self.nq][movable] = np.linalg.lstsq(columns, unforced @ right, rcond=RANK)[0] / weights[movable]
+        if self.angles is not None:  # a radian at most
+            step /= max(1.0, np.abs(step[: self.nq][self.angles]).max(initial=0.0))
+        step[self.nq :] = np.linalg.lstsq(of_mu, right - of_q @ step[: self.nq], rcond=RANK)[0]
+        return step
+
+    def nearest(self, t, p, guess, fixed=()):
+        """Rests [q; μ], first the one to take and then those that the guess excludes no better, and the worst row.
+
+        `guess` has values of coordinates by name, `fixed` are the names of those that stay.
+        """
+        first = np.array([guess.get(name, 0.0) for name in self.coordinates], dtype=float)
+        known, movable = np.isin(self.coordinates, list(guess)), ~np.isin(self.coordinates, list(fixed))
+        self.angles = self._angles(t, p, first)
+        V, _, E = (np.array(part) for part in self._frame(t, first, p))
+        driven = np.abs(V @ E).max(axis=1, initial=0.0) > 0
+        driven, found, reason, sizes = driven if driven.any() else np.ones(self.nq, bool), [], None, None
+        unknown = self.angles & ~known & movable
+        turns = [np.zeros(self.nq), *np.eye(self.nq)[unknown], *([1.0 * unknown] if unknown.sum() > 1 else [])]
+        for turned in (*turns, 0.5 * unknown, -0.5 * unknown):  # in half turns
+            if found and 0.5 in np.abs(turned):
+                break
+            q = self._met(t, p, first + turned * np.pi, movable & driven, movable & ~known, movable)
+            sizes = self._sizes(t, p, q) if sizes is None else sizes
+            z, rests, worst = self.reached(t, p, q, movable, sizes * np.where(known, GUESSED, 1.0))
+            reason = reason or worst
+            if rests and not any(self._alike(z, other) for other in found):
+                found.append(z)
+        for z in found:
+            z[: self.nq] += self.angles * 2 * np.pi * np.round((first - z[: self.nq]) / (2 * np.pi))
+        return self._ordered(t, p, found, first, known, sizes), reason
+
+    def _alike(self, z, other):
+        """Whether rests differ by full turns only."""
+        apart = (z - other)[: self.nq]
+        apart -= self.angles * 2 * np.pi * np.round(apart / (2 * np.pi))
+        return bool(np.all(np.abs(apart) <= ALIKE * (1.0 + np.abs(other[: self.nq]))))
+
+    def _angles(self, t, p, q):
+        """Coordinates that a full turn leaves as they are, and another change does not."""
+        z = np.random.default_rng(SEED).uniform(-1.0, 1.0, self.function.size1_in(1))
+        z[: self.nq] += q
+        turns = np.eye(len(z))[: self.nq] * 2 * np.pi
+        changed = [[self.measured(t, z + part * turn, p)[0] for turn in turns] for part in (0.0, 1.0, 0.1)]
+        whole, other = (np.abs(np.subtract(some, changed[0])).max(axis=1, initial=0.0) for some in changed[1:])
+        return whole < ALIKE * other
+
+    def _met(self, t, p, q, *sets):
+        """q on the constraints and the program by the first set of movable coordinates that gets there.
+
+        The last one begins where the one before it ended.
+        """
+        for movable in sets:
+            z, there, _ = self.reached(t, p, ended if movable is sets[-1] else q, movable, some=slice(self.n, None))
+            ended = z[: self.nq]
+            if there:
+                break
+        return ended
+
+    def _sizes(self, t, p, q):
+        """The root of each coordinate's inertia, where it has one."""
+        V, M, _ = (np.array(part) for part in self._frame(t, q, p))
+        with np.errstate(all="ignore"):
+            sizes = np.sqrt(np.diag(np.linalg.pinv(V).T @ M @ np.linalg.pinv(V)))
+        heavy = np.isfinite(sizes) & (sizes > 0)
+        return np.where(heavy, sizes, sizes[heavy].min(initial=np.inf) if heavy.any() else 1.0)
+
+    def _ordered(self, t, p, found, first, known, sizes):
+        """The rest to take, and others that are as near to the guess."""
+        if not found:
+            return []
+        away = [(z[: self.nq] - first) * sizes for z in found]
+        lists = [[np.linalg.norm(a[some]) for a in away] for some in (known, self.angles & ~known, ~known)]
+        guessed, turned, far = map(np.array, lists)
+        near = np.flatnonzero(_least(guessed))
+        left = near[_least(turned[near])]
+        heights = np.array([self._lifted(t, p, found[left[0]], found[i]) for i in left[1:]])
+        left = left[_least(np.append(0.0, heights))]
+        left = left[_least(far[left])]
+        return [found[left[0]], *(found[i] for i in near if i != left[0])]
+
+    def _lifted(self, t, p, one, other):
+        """The potential energy of a state above that of another, by the work of the forces at rest."""
+        way, work = (other - one)[: self.nq], 0.0
+        for at, weight in zip(*np.polynomial.legendre.leggauss(NEWTON // 2), strict=True):
+            z = np.concatenate([one[: self.nq] + 0.5 * (1 + at) * way, np.zeros(len(one) - self.nq)])
+            V = np.array(self._frame(t, z[: self.nq], p)[0])
+            work += 0.5 * weight * (self.measured(t, z, p)[0][: self.n] @ np.linalg.pinv(V) @ way)
+        return work
+
+
+def _least(values):
+    """Which values are the least, but for what decides nothing."""
+    return values - values.min() <= ALIKE * np.abs(values).max()
+
+
+def _still(q, expressions):
+    """Expressions with all rates zero."""
+    rates = [s for s in ca.symvar(expressions) if (q.where(s) or ("t", 0, 0))[0] == "w"]
+    return ca.substitute(expressions, ca.vertcat(*rates), ca.SX.zeros(len(rates))) if rates else expressions
