@@ -453,7 +453,7 @@ def test_a_span_that_ends_within_a_path_that_is_singular_at_rest(crane):
 
 
 @pytest.mark.parametrize("start, fact", [
-    ({"x": 0.0, "theta": 0.1, "dx": 0.0, "dtheta": 0.0}, "d2theta"),
+    ({"x": 0.0, "theta": 0.1, "dx": 0.0, "dtheta": 0.0}, "balance of theta"),
     ({"x": 0.0, "theta": 0.0, "dx": 0.3, "dtheta": 0.0}, "dx = 0.3"),
     ({"theta": 0.2}, "theta"),
 ])  # fmt: skip

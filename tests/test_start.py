@@ -140,7 +140,7 @@ def test_conditions_may_contain_higher_derivatives_than_the_state():
         (sv.SpecificationError, {"hold": {"a": 3.0}}, {"name": "a"}),
         (sv.SpecificationError, {"hold": {"a": "x"}}, {"type": "str"}),
         (sv.SpecificationError, {"hold": {"a": ca.SX.sym("z")}}, {"name": "z"}),
-        (sv.InconsistentStart, {"x": 1.0, "east": 0.0}, {"held": "east", "nearest_value": 1.0}),
+        (sv.InconsistentStart, {"x": 1.0, "east": 0.0}, {"held": "x", "nearest_value": 0.0}),
         (sv.InconsistentStart, {"x": 0.0, "speed": -1.0}, {"held": "speed", "value": -1.0}),
     ],
 )

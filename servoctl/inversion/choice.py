@@ -18,7 +18,7 @@ from servoctl.errors import (
 )
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
-from servoctl.inversion.transfer import Near, rest_near
+from servoctl.inversion.transfer import Near, rests
 from servoctl.inversion.verdict import (
     FLAT,
     GROWS,
@@ -215,11 +215,12 @@ class Request:
         try:
             return relaxed(full, self.program, self.span, start=start, **options)
         except InconsistentStart:
-            values = isinstance(start, Mapping) and {*start} <= {*q.names}
-            near = rest_near(full, self.program, self.span[0], start) if values else None
-            if near is None:
+            some, numbers = rests(full, self.program)
+            near = some.nearest(self.span[0], numbers, start)[0] if isinstance(start, Mapping) else []
+            if not near:
                 raise
-            return relaxed(full, self.program, self.span, start=near, **options)
+            start = dict(zip(q.names, near[0].tolist(), strict=False))
+            return relaxed(full, self.program, self.span, start=start, **options)
 
 
 def _no_plan(why, error):

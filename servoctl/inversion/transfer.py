@@ -8,10 +8,10 @@ import numpy as np
 
 from servoctl.checks import finite, interval, mapping, numbers_by_name
 from servoctl.errors import InconsistentStart, LimitExceeded, ServoError, SpecificationError, unknown
-from servoctl.inversion.equilibrium import RANK, Equilibria
 from servoctl.inversion.transcription import Node
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.model.model import derive
+from servoctl.model.rests import RANK, Rests
 from servoctl.model.start import State
 from servoctl.plants.driven import at_once
 from servoctl.simulation import simulated
@@ -75,7 +75,7 @@ class Transfer:
         self.n, self.m, self.nq = plant.n_x, len(plant.inputs), plant.mechanism.q.nq
         self.bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
         self.node = Node(plant, program, self._bounded())
-        self.equilibria = Equilibria(plant, program, self.node)
+        self.rests, self.numbers = rests(plant, program)
         self.begin, self.held = self._begin(start)
         self.states, self.inputs, self.sizes = self._guess()
         self.opening = self._opening(start.state) if isinstance(start, Near) else None
@@ -108,40 +108,38 @@ class Transfer:
     def _begin(self, start):
         """The state at t0, and the inputs that hold it at rest; None if it may move."""
         nq, t0 = self.nq, self.span[0]
-        zero = np.zeros(nq + self.m)
         if start is None or isinstance(start, dict) and set(start) <= set(self.plant.mechanism.q.names):
             self._require_standing(t0, "start")
-            names, guess = list(self.plant.mechanism.q.names), zero[:nq].copy()
-            if self._exact is not None:
-                guess = self._exact.jets[:nq, 0].copy()
-            given = numbers_by_name(start, names, "coordinate", "start")
-            fixed = [names.index(name) for name in given]
-            guess[fixed] = list(given.values())
-            rest, worst = self.equilibria.at(t0, guess, zero[nq:], fixed)
-            if rest is None:
+            given = numbers_by_name(start, self.plant.mechanism.q.names, "coordinate", "start")
+            found, worst = self.rests.nearest(t0, self.numbers, given, given)
+            if not found:
                 raise _no_rest("start", t0, worst)
-            return np.concatenate([rest[0], np.zeros(self.n - nq)]), self._held(rest, "start")
+            return np.concatenate([found[0][:nq], np.zeros(self.n - nq)]), self._held(found[0], "start")
         start = start.state if isinstance(start, Near) else start
         values = start.values[: self.n] if isinstance(start, State) else start
         x = self.plant.state(values)
         if not self._to_rest:
             return x, None
         self._require_standing(t0, "start")
-        rest, worst = self.equilibria.at(t0, x[:nq], zero[nq:], range(nq), self.equilibria.program)
+        some = [name not in self.program.residuals for name in self.rests.names]
+        fixed = np.zeros(nq, bool)
+        rest, there, worst = self.rests.reached(t0, self.numbers, x[:nq], fixed, some=some)
         speeds = dict(zip(self.plant.state_names[nq:], x[nq:].tolist(), strict=True))
-        if rest is None or np.any(x[nq:]):
+        if not there or np.any(x[nq:]):
             raise _no_equilibrium(t0, worst, speeds)
         return x, self._held(rest, "start")
 
     def _held(self, rest, where):
         """Inputs that hold a rest within the limits of magnitude."""
-        (q, u), t = rest, self.span[where == "end"]
+        t, u = self.span[where == "end"], rest[self.nq : self.nq + self.m]
         low, high = np.array([self.limits.get(name, (-np.inf, np.inf)) for name in self.plant.inputs]).reshape(-1, 2).T
         if np.all((u >= low) & (u <= high)):
             return u
         from scipy.optimize import lsq_linear
 
-        B = self.equilibria.slopes(t, q, u)[:, self.nq :]
+        B = self.rests.measured(t, rest, self.numbers)[1][:, self.nq :]
+        held, free = np.split(B, [self.m], axis=1)  # by inputs and by the forces of constraints
+        B = held - free @ np.linalg.lstsq(free, held, rcond=RANK)[0]
         found = lsq_linear(B, B @ u, (low, high), tol=1e-12)
         if np.abs(B @ (found.x - u)).max() <= 1e-6 * np.abs(B @ u).max():
             return np.clip(found.x, low, high)
@@ -198,18 +196,17 @@ class Transfer:
             )
         t1 = self.span[1]
         self._require_standing(t1, "end")
-        last = np.concatenate([self.states[: self.nq, -1], self.inputs[:, -1]])
-        rest, worst = self.equilibria.at(t1, last[: self.nq], last[self.nq :])
-        if rest is None:
+        rest, there, worst = self.rests.reached(t1, self.numbers, self.states[: self.nq, -1])
+        if not there:
             raise _no_rest("end", t1, worst)
         held = self._held(rest, "end")
-        slopes = self.equilibria.slopes(t1, *rest)
+        slopes = self.rests.measured(t1, rest, self.numbers)[1]
         slopes = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300)
         open_directions = np.linalg.svd(slopes)[2][np.linalg.matrix_rank(slopes, RANK) :, : self.nq]
         if np.abs(open_directions).max(initial=0.0) < RANK:  # the rest is isolated
-            return np.concatenate([rest[0], np.zeros(self.n - self.nq)]), held, None
+            return np.concatenate([rest[: self.nq], np.zeros(self.n - self.nq)]), held, None
         open_[self.nq :] = 0.0
-        return open_, held, self._independent(rest)
+        return open_, held, self._independent(rest[: self.nq], held)
 
     def _opening(self, start):
         """A function of (t, x) that vanishes on the program for all values of the unstable modes; None if none are.
@@ -276,15 +273,20 @@ class Transfer:
                         name=name, t=float(t[k]), value=float(value), limit=(low, high),
                     )  # fmt: skip
 
-    def _independent(self, rest):
+    def _independent(self, rest, held):
         """A function of (t, x, v) whose values vanish at rests near this one, without dependent rows."""
         from scipy.linalg import qr
 
-        slopes = self.equilibria.slopes(self.span[1], *rest)
+        node, q = self.node, self.node.q
+        rows = {**self.plant.mechanism.constraints, **self.program.residuals, **q.invariants}
+        rows = ca.vertcat(node.acceleration, *(node.known(e) for e in rows.values() if q.order(e) <= 0))
+        rows = ca.substitute(rows, q.jet(1), ca.SX.zeros(q.n))
+        unknown = ca.vertcat(q.jet(0), node.v[: self.m])
+        slopes = ca.Function("slopes", [q.t, unknown], [ca.densify(ca.jacobian(rows, unknown))])
+        slopes = np.array(slopes(self.span[1], np.concatenate([rest, held])))
         scaled = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300)
         order = qr(scaled.T, pivoting=True)[2][: np.linalg.matrix_rank(scaled, RANK)]
-        rows = self.equilibria.rows(self.node.q.t, self.node.state[: self.nq], self.node.v[: self.m])
-        return self.node.function("rest", rows[np.sort(order).tolist()])
+        return node.function("rest", rows[np.sort(order).tolist()])
 
     # where the iteration begins
 
@@ -331,9 +333,12 @@ class Transfer:
 
     def _quasi_static(self, times):
         """Rests at frozen instants, with the speeds and the inertia of moving through them slowly."""
-        held = np.zeros(self.m) if self.held is None else self.held
-        rests = self.equilibria.along(times, self.begin[: self.nq], held)
-        rests[:, 0] = np.concatenate([self.begin[: self.nq], held])
+        rests, z = np.full((self.nq + self.m, len(times)), np.nan), self.begin
+        for k, t in enumerate(times):
+            z, there, _ = self.rests.reached(t, self.numbers, z[: self.nq])
+            rests[:, k] = z[: self.nq + self.m] if there else np.nan
+        rests[: self.nq, 0] = self.begin[: self.nq]
+        rests[self.nq :, 0] = np.zeros(self.m) if self.held is None else self.held
         known = np.isfinite(rests).all(axis=0)
         rests = np.array([np.interp(times, times[known], row[known]) for row in rests])
         q, u = rests[: self.nq], rests[self.nq :]
@@ -369,26 +374,10 @@ def _at_each(f, t, x, v):
     return [np.array(part).reshape(part.size1(), len(t), -1).swapaxes(0, 1) for part in values]
 
 
-def rest_near(plant, program, t, start):
-    """The coordinates of a rest at which a program is met, near values of some of them; None if there is none.
-
-    Parameters
-    ----------
-    plant : Plant
-    program : Program
-    t : float
-        [s]
-    start : dict of str to float
-
-    Returns
-    -------
-    dict of str to float or None
-    """
-    names = plant.mechanism.q.names
-    node = Node(at_once(plant), program, {})
-    near = np.array([start.get(name, 0.0) for name in names])
-    rest, _ = Equilibria(at_once(plant), program, node).at(t, near, np.zeros(len(plant.inputs)))
-    return None if rest is None else dict(zip(names, rest[0].tolist(), strict=True))
+def rests(plant, program):
+    """The rests of a plant under a program with any inputs, and the numbers of its parameters."""
+    numbers = np.array(plant.parameters[: len(plant.mechanism.parameters.names)])
+    return Rests.of_program(plant.mechanism, plant.equations.forces, program), numbers
 
 
 def state_sizes(x, nq, span):

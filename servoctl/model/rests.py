@@ -21,13 +21,14 @@ SEED = 1788  # of the point at which angles are told apart
 
 
 class Rests:
-    """The rests of a mechanism under a balance r (n,), directions B of what holds it, and rows by name.
+    """The rests of a mechanism under a balance r (n,), directions B of what holds it, and expressions by name.
 
+    Expressions of the coordinates are rows: those of velocities say nothing of where a machine stands.
     p are the numbers of the mechanism's parameters, z = [q; μ].
     """
 
     def __init__(self, mechanism, balance, B, rows):
-        q = mechanism.q
+        q, rows = mechanism.q, {name: e for name, e in rows.items() if mechanism.q.order(e) <= 0}
         self.coordinates, self.nq, self.n = q.names, q.nq, q.n
         self.names = (*(f"balance of {name}" for name in q.force_names), *rows)
         mu, p, self.angles = ca.SX.sym("mu", B.shape[1]), ca.vertcat(*mechanism.parameters.symbols), None
@@ -75,6 +76,8 @@ class Rests:
             best, least = (z, largest) if largest < least else (best, least)
             z = z + self._step(rows, slopes, movable, weights)
         rows, _, off = (part[some] for part in self.measured(t, best, p))
+        if not len(rows):
+            return best, True, None
         worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
         return best, least <= AT_REST, (self.names[np.arange(len(self.names))[some][worst]], float(rows[worst]))
 

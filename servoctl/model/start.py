@@ -312,23 +312,22 @@ def _at_guess(equations, x, aim, guessed):
     return x
 
 
-def _starts(equations, aim, *others):
-    """The reference, the nearest state with all guessed values, others, then points farther from the reference."""
+def _starts(equations, aim):
+    """The reference, the nearest state with all guessed values, then points farther from the reference."""
     yield aim.reference
     guessed = aim.movable & (aim.weights > 1.0)
     if guessed.any():
         yield gauss_newton(equations, aim.reference, replace(aim, movable=aim.movable & ~guessed))
-    yield from others
     spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.sqrt(aim.weights)
     rng = np.random.default_rng(SEED)
     for attempt in range(1, TRIES):
         yield aim.reference + attempt * FARTHER * rng.uniform(-1.0, 1.0, len(spread)) * spread
 
 
-def _best(equations, aim, *others):
+def _best(equations, aim):
     """The solution nearest to the guess and then to the reference, from two points, from others if it fails."""
     found, guessed = [], aim.weights > 1.0
-    for attempt, first in enumerate(_starts(equations, aim, *others)):
+    for attempt, first in enumerate(_starts(equations, aim)):
         x = _nearest(equations, gauss_newton(equations, first, aim), aim)
         residual, away = _largest(equations, x), np.linalg.norm((x - aim.reference)[guessed])
         found.append((0 if residual < TOLERANCE else residual, away, attempt, x))
@@ -385,14 +384,14 @@ def _largest(equations, x):
 
 
 def _nearest(equations, x, aim, iterations=40):
-    """The solution nearest the reference, by successive projection."""
+    """The solution nearest the reference, by successive projection; a state without values where that is singular."""
     for _ in range(iterations):
         value, jacobian = equations(x)
         with np.errstate(all="ignore"):
             trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
         trial = gauss_newton(equations, trial, aim, 12)
         distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
-        if not (_largest(equations, trial) < TOLERANCE and distance < before * (1 - 1e-12)):
+        if np.abs(equations.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
             break
         x = trial
     return x
@@ -462,7 +461,7 @@ def _refuse(equations, aim, conditions, held, x):
     """Raise InconsistentStart: a held value contradicts an equation, or no state satisfies one."""
     residuals = np.abs(equations.scaled(x))
     alone, all_movable = equations.without(conditions), replace(aim, movable=np.ones(len(aim.names), dtype=bool))
-    if held and _best(alone, all_movable, x)[1] < TOLERANCE:
+    if held and _loosened(alone, all_movable, x)[1] < TOLERANCE:
         change, nearest = _nearest_held(equations, aim, held, x)
         largest, worst = max(zip(residuals, equations.rows, strict=True))
         by_others = "the constraints together with the other held values"
@@ -481,12 +480,19 @@ def _refuse(equations, aim, conditions, held, x):
     raise _not_found(equations, x, residuals)
 
 
+def _loosened(equations, aim, x):
+    """As `_best`; where the nearest state is singular, the one that Newton's method reaches from x."""
+    y, residual = _best(equations, aim)
+    y = y if residual < TOLERANCE else gauss_newton(equations, x, aim)
+    return y, _largest(equations, y)
+
+
 def _nearest_held(equations, aim, held, x):
     """The held value whose least relative change agrees with the others, and that value, None where none does."""
     change, nearest, least = next(iter(held)), None, np.inf
     for name, value in held.items():
         loose = replace(aim, movable=aim.movable | np.isin(aim.names, name))
-        y, residual = _best(equations.without([name]), loose, x)
+        y, residual = _loosened(equations.without([name]), loose, x)
         if not residual < TOLERANCE:
             continue
         is_state = name in aim.names
