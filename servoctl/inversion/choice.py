@@ -75,7 +75,7 @@ def inverse(
     t_span : (t0, t1)
         [s]; the bounded motion begins before and ends after it.
     start : State or dict of str to float, optional
-        A state of the model, or values near the start by name. Default: near zero. Motions that may begin at rest do;
+        A state of the model, or values near the start by name. Motions that may begin at rest do;
         relaxed plans that begin in motion begin on their bounded motion, near values by name.
     method : Method or str, optional
         A method of `simulate`, or "relaxed", instead of the one that the verdict chooses; where it is another one, a

@@ -699,17 +699,18 @@ class Model(Detailed):
     ) -> State:  # fmt: skip
         """Consistent initial values: those passed are fixed, the others follow from the constraints and their rates.
 
-        Where several states have the held values, the one that Newton's method reaches from the guess is taken; the
-        printed state names others that a short search finds.
+        Where several states have the held values, the one nearest to the guess is taken; the printed state names others
+        that a short search finds.
 
         Parameters
         ----------
         t : float
             Time of the start [s].
         guess : dict of str to float, optional
-            Approximate values: free ones start there if that is consistent. Values without a guess are as near to zero
-            as the invariants allow. A coordinate that the model leaves out, and that is named here or held, is a part
-            of the state, and of the motions that begin there.
+            Approximate values; those passed to `derive` where there are none here. Where a path begins at rest, the
+            start is the state of rest nearest to them. Elsewhere free values start there if that is consistent; values
+            without a guess are as near to zero as the invariants allow. A coordinate that the model leaves out, and
+            that is named here or held, is a part of the state, and of the motions that begin there.
         hold : dict of str to SX, optional
             Further conditions by name: expressions of t, the coordinates and their derivatives of any order that are
             zero at the start, such as `{"heading": ca.atan2(dy, dx) - 0.5}`.
@@ -732,6 +733,9 @@ class Model(Detailed):
             If the machine stands still, its constraints leave a coordinate open there, and the motion has no limit.
         """
         model = self.including([*names_of(held), *names_of(guess)])
+        guess = mapping(guess, "The guesses")
+        derived_at = self._store.specification[2] or {}
+        guess = {name: value for name, value in derived_at.items() if name in model.state_names} | guess
         return started(model, finite("t", t, "time"), held, guess, hold)
 
     def structure(self, motion=None, jets=None):

@@ -76,17 +76,18 @@ class Standstill:
 def started(model, t, held, guess, hold):
     """See `Model.start`: a consistent state, at a standstill the limit of the motion that follows."""
     state = failure = None
+    chosen = {**(guess or {}), **{name: value for name, value in held.items() if name in model.state_names}}
     try:
         state = consistent(model, t, held, guess, hold)
         if _determined(model, state):
             if _faint(model, t, state.values):
-                raise _division(model, t, state.values, {**(guess or {}), **held}, FAINT)
+                raise _division(model, t, state.values, chosen, FAINT)
             return state
     except InconsistentStart as error:
         failure = error
-    chosen = {**(guess or {}), **held}
     still = standstill(model, t, chosen)
-    if still is not None and not hold and not set(still.coordinates) <= set(held):
+    determined = state is not None and not set(still.coordinates if still else ()) & set(state.free)
+    if still is not None and not hold and not determined:
         try:
             return _limit(model, t, held, chosen, still)
         except SingularProgram:  # without a limit a guess chooses

@@ -11,12 +11,11 @@ from servoctl.checks import column, finite, mapping
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, unknown
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
-from servoctl.model.rests import Rests
+from servoctl.model.rests import GUESSED, Rests
 from servoctl.spec.mechanism import require_known
 from servoctl.values import Value, frozen
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
-GUESSED = 1e3  # weight of a guessed value relative to one without a guess
 TRIES = 6  # initial points of the iteration; the first is the reference
 FARTHER = 0.1  # distance of each further initial point from the reference, relative to the state's size
 SEED = 1788  # seed of these points
@@ -48,7 +47,7 @@ class State(Value, Shown):
     held : tuple of str
         Names of the fixed values, outputs and conditions.
     free : tuple of str
-        Further names that the invariants leave free; their values come from the guess or are near zero.
+        Further names that the invariants leave free; their values come from a rest, the guess, or are near zero.
     residual : float
         Largest scaled residual.
     at_rest : tuple of str
@@ -194,10 +193,14 @@ def consistent(model, t, held, guess, hold):
 
 
 def _rests(model, t, aim, held, conditions):
-    """The equations, and the rest nearest to the guess before others like it, where a path begins at rest; else None."""
+    """The equations, and the rest nearest to the guess before others like it, where a path begins at rest; else None.
+
+    A program without a path rests where nothing was guessed.
+    """
     q, residuals = model.reduction.mechanism.q, model.reduction.program.residuals.values()
-    rates = held.keys() - set(q.names)
-    if not any(ca.depends_on(e, q.t) for e in residuals) or any(held[name] for name in rates):
+    rates, guessed = held.keys() - set(q.names), (aim.weights > 1.0).any()
+    timed = any(ca.depends_on(e, q.t) for e in residuals)
+    if not residuals or guessed and not timed or any(held[name] for name in rates):
         return None
     equations, rests = JetEquations(model, t, conditions), model.once("rests", lambda: Rests.of_model(model))
     chosen = zip(q.names, aim.reference, (aim.weights > 1.0) | ~aim.movable, strict=False)
