@@ -8,7 +8,7 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import MOST_JETS, as_numbers, finite, named, whole
+from servoctl.checks import MOST_JETS, as_numbers, finite, mapping, named, whole
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.errors import ServoError, SingularProgram, SpecificationError, unknown
 from servoctl.jets.series import Flow

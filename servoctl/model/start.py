@@ -1,5 +1,6 @@
 """Consistent starts: held values exact, every invariant satisfied, the rest as near its guess as possible."""
 
+from contextlib import suppress
 from copy import copy
 from dataclasses import field, replace
 from math import factorial
@@ -13,6 +14,7 @@ from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
 from servoctl.model.rests import GUESSED, Rests
 from servoctl.spec.mechanism import require_known
+from servoctl.tolerances import RESOLVED
 from servoctl.values import Value, frozen
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
@@ -202,11 +204,16 @@ def _rests(model, t, aim, held, conditions):
     timed = any(ca.depends_on(e, q.t) for e in residuals)
     if not residuals or guessed and not timed or any(held[name] for name in rates):
         return None
-    equations, rests = JetEquations(model, t, conditions), model.once("rests", lambda: Rests.of_model(model))
+    rests = model.once("rests", lambda: Rests.of_model(model))
     chosen = zip(q.names, aim.reference, (aim.weights > 1.0) | ~aim.movable, strict=False)
     guess = {name: value for name, value, known in chosen if known}
     found, _ = rests.nearest(t, model.parameters, guess, held.keys() - rates)
-    states = [np.concatenate([z[: q.nq], np.zeros(len(equations.names) - q.nq)]) for z in found]
+    states = [np.concatenate([z[: q.nq], np.zeros(len(aim.names) - q.nq)]) for z in found]
+    equations = JetEquations(model, t, conditions)
+    jets = np.append(states[0][: len(model.state_names)], np.zeros(model.n)) if states else None
+    if states and not _largest(equations, states[0]) < TOLERANCE and model.strength(t, jets) <= RESOLVED:
+        with suppress(ServoError):  # a pivot of the model vanishes there
+            equations = JetEquations(model.near(t, jets), t, conditions)
     states = [x for x in states if _largest(equations, x) < TOLERANCE and _stays(model, t, x)]
     others = [x for x in states[1:] if not _clear_choice(states[0], x, aim, model)]
     return (equations, np.array([states[0], *others])) if states else None
