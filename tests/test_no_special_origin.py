@@ -66,7 +66,9 @@ def passive_arm(at=0.0):
     base, elbow = q
     tip = ca.vertcat(ca.cos(base), ca.sin(base)) + 0.3 * ca.vertcat(ca.cos(base + elbow), ca.sin(base + elbow))
     S = sv.particle(q, 2.0, ca.vertcat(ca.cos(base), ca.sin(base))) + sv.particle(q, 1.0, tip)
-    mechanism = sv.Mechanism(q, S, potential=2.0 * elbow**2, forces={"elbow": -0.3 * q.d(1)[1]}, actuators={"tau": base})
+    mechanism = sv.Mechanism(
+        q, S, potential=2.0 * elbow**2, forces={"elbow": -0.3 * q.d(1)[1]}, actuators={"tau": base}
+    )
     return mechanism, sv.Program({"y": base + 0.2 * elbow - rest_to_rest(q, at, at + 1.0, 3.0)})
 
 
@@ -160,6 +162,8 @@ def test_scenes_need_the_same_forces_in_other_coordinates(name):
     for built, known in (((mechanism, program), lambda some: some or {}),
                          ((machine, residuals), lambda some: values(some, names, shifts, scales))):  # fmt: skip
         model = sv.derive(*built, known(scene.guess) or None)
-        plans.append(sv.simulate(model, model.start(scene.t_span[0], known(scene.guess), **known(scene.start)), scene.t_span))
+        plans.append(
+            sv.simulate(model, model.start(scene.t_span[0], known(scene.guess), **known(scene.start)), scene.t_span)
+        )
     assert plans[1].model.flat == plans[0].model.flat
     assert same(*plans, FLAT if plans[0].model.flat else INTEGRATED)

@@ -13,7 +13,6 @@ from servoctl.methods.bounded import End, FreeEntries
 from servoctl.model.model import derive
 from servoctl.model.rests import RANK, Rests
 from servoctl.model.start import State
-from servoctl.plants.driven import at_once
 from servoctl.simulation import simulated
 from servoctl.values import frozen
 

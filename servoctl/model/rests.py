@@ -61,7 +61,7 @@ class Rests:
         return rows[:, 0], slopes, np.abs(rows[:, 0]) / np.maximum(np.abs(slopes) @ (1.0 + np.abs(z)), TINY)
 
     def reached(self, t, p, q, movable=None, weights=None, some=slice(None)):
-        """[q; μ] nearest to a rest that Newton's method finds by least weighted steps, whether it is one, the worst row.
+        """[q; μ] nearest to a rest by Newton's least weighted steps, whether it is one, and its worst row.
 
         Only some coordinates are movable, and only some rows need to vanish.
         """
@@ -103,23 +103,25 @@ class Rests:
         first = np.array([guess.get(name, 0.0) for name in self.coordinates], dtype=float)
         known, movable = np.isin(self.coordinates, list(guess)), ~np.isin(self.coordinates, list(fixed))
         self.angles = self._angles(t, p, first)
-        V, _, E = (np.array(part) for part in self._frame(t, first, p))
-        driven = np.abs(V @ E).max(axis=1, initial=0.0) > 0
-        driven, found, reason, sizes = driven if driven.any() else np.ones(self.nq, bool), [], None, None
-        unknown = self.angles & ~known & movable
-        turns = [np.zeros(self.nq), *np.eye(self.nq)[unknown], *([1.0 * unknown] if unknown.sum() > 1 else [])]
-        for turned in (*turns, 0.5 * unknown, -0.5 * unknown):  # in half turns
+        found, reason, sizes = [], None, None
+        for turned in self._turns(self.angles & ~known & movable):
             if found and 0.5 in np.abs(turned):
                 break
-            q = self._met(t, p, first + turned * np.pi, movable & driven, movable & ~known, movable)
+            q = self._met(t, p, first + turned * np.pi, known, movable)
             sizes = self._sizes(t, p, q) if sizes is None else sizes
             z, rests, worst = self.reached(t, p, q, movable, sizes * np.where(known, GUESSED, 1.0))
             reason = reason or worst
             if rests and not any(self._alike(z, other) for other in found):
+                z[: self.nq] += self.angles * 2 * np.pi * np.round((first - z[: self.nq]) / (2 * np.pi))
                 found.append(z)
-        for z in found:
-            z[: self.nq] += self.angles * 2 * np.pi * np.round((first - z[: self.nq]) / (2 * np.pi))
         return self._ordered(t, p, found, first, known, sizes), reason
+
+    @staticmethod
+    def _turns(angles):
+        """By how many half turns angles are turned: none, each, all, and where no rest was found all by a quarter."""
+        yield 0.0 * angles
+        yield from np.eye(len(angles))[angles]
+        yield from (k * angles for k in (1.0, 0.5, -0.5))
 
     def _alike(self, z, other):
         """Whether rests differ by full turns only."""
@@ -136,17 +138,16 @@ class Rests:
         whole, other = (np.abs(np.subtract(some, changed[0])).max(axis=1, initial=0.0) for some in changed[1:])
         return whole < ALIKE * other
 
-    def _met(self, t, p, q, *sets):
-        """q on the constraints and the program by the first set of movable coordinates that gets there.
-
-        The last one begins where the one before it ended.
-        """
-        for movable in sets:
-            z, there, _ = self.reached(t, p, ended if movable is sets[-1] else q, movable, some=slice(self.n, None))
-            ended = z[: self.nq]
+    def _met(self, t, p, q, known, movable):
+        """q on the constraints and the program, moved by the actuators, by what nobody guessed, at last by anything."""
+        V, _, E = (np.array(part) for part in self._frame(t, q, p))
+        driven, first = np.abs(V @ E).max(axis=1, initial=0.0) > 0, q
+        for some in (movable & driven, movable & ~known, movable):
+            z, there, _ = self.reached(t, p, q if some is movable else first, some, some=slice(self.n, None))
+            q = z[: self.nq]
             if there:
                 break
-        return ended
+        return q
 
     def _sizes(self, t, p, q):
         """The root of each coordinate's inertia, where it has one."""

@@ -81,8 +81,11 @@ class State(Value, Shown):
         return (
             f"State at t = {self.t:g} s\n  {shown}\n  held: {held}; left free: {free}\n"
             f"  largest residual {self.residual:.1e}"
-            + (f"\n  at rest; {rest} by the limit of the motion that follows, which can be simulated once it moves"
-               if self.at_rest else "")
+            + (
+                f"\n  at rest; {rest} by the limit of the motion that follows, which can be simulated once it moves"
+                if self.at_rest
+                else ""
+            )
             + self._told_apart()
         )
 
