@@ -9,6 +9,7 @@ of a function that is called often are compiled too, with CasADi's operations on
 import functools
 import itertools
 import math
+import os
 
 import casadi as ca
 import numpy as np
@@ -395,20 +396,22 @@ class Compiled:
         """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
         if self._too_long:
             return self._interpreter
-        return self._loaded("_library", self.source, self._level)
+        return self._loaded("_library", self.source, lambda: self._level)
 
     @property
     def _lanes(self):
         """Evaluator of long grids: a separate library, because twice the code takes twice the time to compile."""
         if "newton" in self.loops:
             return self._library
-        return self._loaded("_lanes", lambda: emit.emit(self.expression, self._symbol), "-O1")
+        return self._loaded("_lanes", lambda: emit.emit(self.expression, self._symbol), lambda: "-O1")
 
     def _loaded(self, name, source, level):
         """Evaluator by the library of a C text, which takes long to write and is not written without a compiler."""
+        if os.environ.get("SERVOCTL_COMPILER") == "none":
+            return self._interpreter
         if name not in vars(self):
-            text = source() if compiler.compiler() else ""
-            library = compiler.library(text, level, calls=self._in_loops)
+            text = (source(), level()) if compiler.compiler() else ("",)
+            library = compiler.library(*text, calls=self._in_loops)
             if library is None and not compiler.worth_compiling(self._in_loops):
                 return self._interpreter
             self._text, found = None, self._interpreter
