@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError, unknown
+from servoctl.names import meant
 
 ON_SAMPLE = 1e-6  # rounding of a sampling instant [periods], or of a count
 MOST_CASES = 10**6  # of one sweep: some gigabytes of parameters and rows
@@ -131,10 +132,21 @@ def as_list(value):
 
 
 def named(value, names, what):
-    """One of the names, or `NameUnknown`; `what` they name: "signal"."""
-    if not (isinstance(value, str) and value in names):
+    """The one of the names that is meant, or `NameUnknown`; `what` they name: "signal"."""
+    if (found := meant(value, names, what)) is None:
         raise unknown(value, names, what)
-    return value
+    return found
+
+
+def by_name(values, names, what, given):
+    """A dict whose keys mean some of the names, by these; `given` begins the message: "The limits"."""
+    found = {}
+    for name, value in mapping(values, given).items():
+        if (full := named(name, names, what)) in found:
+            rule, do = "What is given by name is given once.", "Leave one of them out."
+            raise SpecificationError(f"{given} have {full!r} twice, once by its short name.", rule, do=do, name=full)
+        found[full] = value
+    return found
 
 
 def as_path(value, what="The path"):
@@ -332,9 +344,7 @@ def interval(name, value, what):
 def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
     """Finite numbers by name, none below `low`: each `what` ("actuator") has a `meaning` ("lag")."""
     numbers = {}
-    for name, value in mapping(values, f"The {meaning}s").items():
-        if name not in names:
-            raise unknown(name, names, what)
+    for name, value in by_name(values, names, what, f"The {meaning}s").items():
         numbers[name] = number = finite(name, value, meaning)
         if number < low or (positive and number <= 0):
             raise SpecificationError(

@@ -16,6 +16,7 @@ from servoctl.control.reference import Reference, of_plan, refuse_transport
 from servoctl.control.residuals import Residuals, program_residuals
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
+from servoctl.names import rows_read
 from servoctl.plants.plant import Plant
 from servoctl.run import Run
 from servoctl.values import Deferred
@@ -330,7 +331,9 @@ def _integrals(integral, plan, plant):
     integral = bool(integral) if isinstance(integral, np.bool_) else integral
     if integral is None or integral is False or (isinstance(integral, dict) and not integral):
         return None, None
-    residuals = Residuals(plan.model, plant, tuple(integral) if isinstance(integral, dict) else None)
+    rows, signals = Residuals(plan.model, plant).names, plan.model.reduction.mechanism.signals
+    names = integral if isinstance(integral, dict) else rows_read(rows, signals)
+    residuals = Residuals(plan.model, plant, tuple(names))
     if not residuals.names:
         raise SpecificationError(
             "The program has no residual of order 0 or 1.",

@@ -4,8 +4,9 @@ import re
 
 from servoctl.checks import require_kind
 from servoctl.figures import style
+from servoctl.names import antiderivative
 from servoctl.run import Run
-from servoctl.units import antiderivative, as_units, unit_of
+from servoctl.units import as_units, unit_of
 
 
 def efforts(run):

@@ -19,6 +19,7 @@ from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
+from servoctl.names import meant
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
@@ -145,6 +146,7 @@ def _share_computed(part, span, method, times):
 def _case_table(model, starts, parameters):
     """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
     columns = {} if parameters is None or isinstance(parameters, dict) and not parameters else as_columns(parameters)
+    columns = {meant(name, model.numbers, "parameter") or name: column for name, column in columns.items()}
     lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
