@@ -8,12 +8,11 @@ from types import MappingProxyType
 import numpy as np
 
 from servoctl import archive
-from servoctl.checks import finite, named, whole
+from servoctl.checks import antiderivative, finite, named, rows_read, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
 from servoctl.model.start import State, without_rounding
 from servoctl.model.switching import switching
-from servoctl.names import antiderivative, rows_read
 from servoctl.units import unit_of
 from servoctl.values import Value, frozen, read_only, same
 

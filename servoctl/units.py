@@ -2,9 +2,8 @@
 
 import re
 
-from servoctl.checks import as_list, by_name, mapping
+from servoctl.checks import antiderivative, as_list, by_name, mapping
 from servoctl.errors import SpecificationError
-from servoctl.names import antiderivative
 
 FORCES = {"m": "N", "rad": "N m", "m/s": "N", "rad/s": "N m"}  # unit of a position or a velocity: of its force
 OF_LOOP = ("command ", "input ", "measured ")  # how names of a loop's signals begin in a plain run

@@ -233,7 +233,10 @@ def test_files_of_c_name_each_signal(plan, tmp_path):
 
 def test_the_print_says_the_longer_names(plan):
     mechanism = plan.model.reduction.mechanism
-    for value, names in ((mechanism, "x_input, m1_input, x_output, m1_parameter"), (plan.model, "m1_residual, x_residual")):
+    for value, names in (
+        (mechanism, "x_input, m1_input, x_output, m1_parameter"),
+        (plan.model, "m1_residual, x_residual"),
+    ):
         (line,) = (line for line in str(value).splitlines() if "longer names" in line)
         assert names in line and len(line) <= 120 and len(str(value).splitlines()) <= 8
 

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import ON_SAMPLE, finite, named, positive, require_kind
+from servoctl.checks import ON_SAMPLE, finite, meant, named, positive, require_kind
 from servoctl.codegen.function import Compiled
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
-from servoctl.names import meant
 from servoctl.run import Run
 from servoctl.values import Value, frozen
 

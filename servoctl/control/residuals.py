@@ -5,11 +5,10 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import named
+from servoctl.checks import named, rows_read
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.branches import cse
-from servoctl.names import rows_read
 
 
 class Residuals:

@@ -2,9 +2,8 @@
 
 import re
 
-from servoctl.checks import require_kind
+from servoctl.checks import antiderivative, require_kind
 from servoctl.figures import style
-from servoctl.names import antiderivative
 from servoctl.run import Run
 from servoctl.units import as_units, unit_of
 

@@ -6,14 +6,13 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, interval, mapping, named, numbers_by_name
+from servoctl.checks import finite, interval, mapping, named, numbers_by_name, rows_read
 from servoctl.errors import InconsistentStart, LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.inversion.equilibrium import RANK, Equilibria
 from servoctl.inversion.transcription import Node
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.model.model import derive
 from servoctl.model.start import State
-from servoctl.names import rows_read
 from servoctl.plants.driven import at_once
 from servoctl.simulation import simulated
 from servoctl.values import frozen

@@ -4,10 +4,10 @@ import warnings
 
 import numpy as np
 
+from servoctl.checks import distinct
 from servoctl.errors import ServoError, SingularProgram
 from servoctl.markup import fitted, listed
 from servoctl.model.rest import first_motion, standstill_near
-from servoctl.names import distinct
 from servoctl.reduction.rows import alternatives
 from servoctl.reduction.self_motion import self_motion
 
@@ -16,7 +16,7 @@ LARGEST_EXPLAINED = 20_000  # operations of the accelerations, beyond which rela
 
 def describe(model, full):
     """The lines of a printed model: what was done to the specification; if full, with what the derivation rests on."""
-    r, rows = model.reduction, (_title, _named, _left_out, _raised, _hidden, _free, _chosen, _switches)
+    r, rows = model.reduction, (_title, _longer, _left_out, _raised, _hidden, _free, _chosen, _switches)
     texts = [fitted(lambda room, row=row: row(model, r, room), full) for row in rows]
     return "\n  ".join(filter(None, [*texts, *(_derivation(r) if full else ())])).splitlines()
 
@@ -30,7 +30,7 @@ def _title(model, r, room):
     return f"Model: {names} under the program {listed(program.residuals, room)}; realised by {by}"
 
 
-def _named(model, r, room):
+def _longer(model, r, room):
     """The longer names of what would else bear the name of a coordinate or another signal."""
     read = distinct("residual", r.original, r.mechanism.signals)
     names = [*r.mechanism.longer, *(long for name, long in read.items() if long != name)]

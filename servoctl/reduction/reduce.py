@@ -7,11 +7,10 @@ from itertools import chain
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import by_name, finite, mapping, named
+from servoctl.checks import by_name, distinct, finite, mapping, named
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
 from servoctl.jets.branches import cse
 from servoctl.jets.series import Flow
-from servoctl.names import distinct
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete

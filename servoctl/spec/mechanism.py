@@ -7,14 +7,13 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, mapping, named, require_kind
+from servoctl.checks import column, distinct, mapping, named, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
 from servoctl.jets.branches import as_text, cse
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.markup import Shown, listed
-from servoctl.names import distinct
 from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
@@ -31,6 +30,8 @@ INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, rel
 
 class Mechanism(Shown):
     """A mechanism with forces, actuators and material constraints.
+
+    What bears the name of a coordinate, or of a signal before it, is read by a longer one: slew_input, m1_parameter.
 
     Main arguments
 
@@ -75,7 +76,7 @@ class Mechanism(Shown):
     SpecificationError
         If an expression names a symbol that is no coordinate, parameter or t; if S is not quadratic in γ''; if S
         and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric,
-        or not `mass`; if a coordinate has two units.
+        or not `mass`; if a coordinate has two units, or a name and its longer form are taken.
     NameUnknown
         If a force names no coordinate, or a unit nothing of the mechanism.
     """

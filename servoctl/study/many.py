@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
+from servoctl.checks import as_numbers, as_span, mapping, meant, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
 from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
@@ -19,7 +19,6 @@ from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
-from servoctl.names import meant
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
