@@ -4,6 +4,7 @@ The machine is two masses that do not touch. Everything is called by the coordin
 that is taken for another signal gives other numbers; all expected ones are closed forms.
 """
 
+import pickle
 import re
 
 import casadi as ca
@@ -219,6 +220,18 @@ def test_free_motions_differ_by_parameter_and_by_initial_value():
     found, decay = sv.sensitivity(model, run, of="x", to=["x", "x_parameter"]), np.exp(-run.t)
     assert np.abs(run["x"] - (2.0 - decay)).max() < 1e-7 and plant.parameters[0] == 4.0
     assert np.abs(found["x", "x"] - decay).max() < 1e-6 and np.abs(found["x", "x_parameter"] - (1 - decay)).max() < 1e-6
+
+
+def test_copies_of_other_processes_have_the_same_names(plan):
+    model, mechanism = plan.model, plan.model.reduction.mechanism
+    assert pickle.loads(pickle.dumps(mechanism)) == mechanism
+    copy = pickle.loads(pickle.dumps(model))
+    assert copy == model == sv.derive(mechanism, sv.Program(model.reduction.program.with_turns)) and str(copy) == str(
+        model
+    )
+    plant = pickle.loads(pickle.dumps(sv.plant(mechanism)))  # other symbols of the same names
+    again, law = (sv.lqr(plan, one, integral={"x_residual": 1.0}) for one in (plant, sv.plant(mechanism)))
+    assert np.array_equal(law.schedule, again.schedule)
 
 
 def test_files_of_c_name_each_signal(plan, tmp_path):

@@ -33,7 +33,7 @@ def _title(model, r, room):
 def _longer(model, r, room):
     """The longer names of what would else bear the name of a coordinate or another signal."""
     read = distinct("residual", r.original, r.mechanism.signals)
-    names = [*r.mechanism.longer, *(long for name, long in read.items() if long != name)]
+    names = [*(long for name, long in read.items() if long != name), *r.mechanism.longer]
     return f"longer names, as other signals have the short ones: {listed(names, room)}" * bool(names)
 
 

@@ -15,9 +15,9 @@ class Parameters:
     defaults : dict of str to float
     """
 
-    def __init__(self, values):
+    def __init__(self, values, written=None):  # the symbols' own names, which `renamed` keeps
         self.defaults = dict(values)
-        self._symbols = {name: ca.SX.sym(name) for name in values}
+        self._symbols = dict(zip(values, map(ca.SX.sym, written or values), strict=True))
 
     def __getattr__(self, name):
         symbols = self.__dict__.get("_symbols", {})
@@ -28,7 +28,7 @@ class Parameters:
         raise unknown(name, list(symbols), "parameter")
 
     def __reduce__(self):
-        return Parameters, (self.defaults,)
+        return Parameters, (self.defaults, [symbol.name() for symbol in self.symbols])
 
     def __repr__(self):
         return "Parameters(" + ", ".join(f"{k}={v:g}" for k, v in self.defaults.items()) + ")"
