@@ -18,7 +18,7 @@ HALF = np.arccos(0.5)  # s, where cos t = 0.5
 SPAN = (0.0, 2.0)
 
 
-def machine(names="x m1", a="actuators", **renamed):
+def machine(names="x m1", **renamed):
     """Masses m1 and m2 at coordinates that are named alike; residuals, outputs and actuators are crossed."""
     p, q = sv.parameters(m1=2.0, m2=3.0), sv.coordinates(names)
     (x, y), (first, second) = q, names.split()
@@ -252,6 +252,21 @@ def test_the_print_says_the_longer_names(plan):
     ):
         (line,) = (line for line in str(value).splitlines() if "longer names" in line)
         assert names in line and len(line) <= 120 and len(str(value).splitlines()) <= 8
+
+
+def test_a_residual_of_an_output_has_its_line_in_the_details():
+    mechanism, _ = machine(outputs={"X": ca.SX(7.0)}, actuators={"F": [1.0, 0.0], "G": [0.0, 1.0]})
+    q = mechanism.q
+    model = sv.derive(mechanism, sv.Program({"X": q[0] - ca.cos(q.t), "Y": q[1]}))
+    run = sv.simulate(model, model.start(), SPAN)
+    assert (
+        (run["X"] == 7.0).all()
+        and np.abs(run["X_residual"]).max() < 1e-9
+        and np.array_equal(run["Y"], run.residual["Y"][0])
+    )
+    assert "X_residual" in model.details and "X_residual" not in str(model)
+    events = {"output": sv.Event("X", 7.0), "row": sv.Event("X_residual", 0.5), "other": sv.Event("Y", 0.5)}
+    assert not any(len(t) for t in sv.simulate(model, run.start, SPAN, events=events).t_events.values())
 
 
 NAMES = [  # kind, name, the name under which it is read

@@ -1,6 +1,7 @@
 """The printed form of a model, and what is said of a state at which its program is singular."""
 
 import warnings
+from math import inf
 
 import numpy as np
 
@@ -31,9 +32,13 @@ def _title(model, r, room):
 
 
 def _longer(model, r, room):
-    """The longer names of what would else bear the name of a coordinate or another signal."""
+    """The longer names of what would else bear the name of a coordinate or another signal.
+
+    A residual of an output, as X - path of X, is expected, and has its line in the details alone.
+    """
     read = distinct("residual", r.original, r.mechanism.signals)
-    names = [*(long for name, long in read.items() if long != name), *r.mechanism.longer]
+    told = [name for name in read if room == inf or name not in r.mechanism.outputs]
+    names = [*(read[name] for name in told if read[name] != name), *r.mechanism.longer]
     return f"longer names, as other signals have the short ones: {listed(names, room)}" * bool(names)
 
 
