@@ -1,10 +1,12 @@
 """Checks of input: expressions, kinds and names first, numbers below. Each returns the value in one form or raises.
 
-All raise `SpecificationError`, with the name and the value in its `details`.
+All raise `SpecificationError`, with the name and the value in its `details`. What is read by a name is one signal,
+wherever it is read: `distinct` keeps the names of a mechanism and its program apart, `meant` takes their short forms.
 """
 
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
 
@@ -20,6 +22,11 @@ LEAST_TOLERANCE = 1e-30  # of an integrator: far below the rounding of doubles, 
 MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit into the 64 bits of C
 LONGEST_NAME = 255  # bytes of a file's name in common file systems
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
+SUFFIXES = {
+    "actuator": "_input", "actuator or rate": "_input", "output": "_output", "parameter": "_parameter",
+    "residual": "_residual", "row": "_residual",
+}  # fmt: skip
+OF_REACTIONS = ("multiplier_", "reaction_")  # how names of their components begin
 
 
 def column(value, what, size=None):
@@ -130,11 +137,57 @@ def as_list(value):
         return None
 
 
+def antiderivative(name, names):
+    """(q, k) of the k-th derivative of a signal, or None."""
+    match = re.fullmatch(r"d([2-9]|[1-9]\d+)?(\D.*)", name)
+    return (match[2], int(match[1] or 1)) if match and match[2] in names else None
+
+
+def distinct(kind, names, others, bases=()):
+    """The names under which what is of one kind is read: {name: name, or NAME_input where a signal has that name}.
+
+    Signals are the others, and time derivatives of these and of `bases`. Refused if the longer name is taken, too.
+    """
+    read, names = {}, tuple(names)
+    for name in names:
+        taken = name in others or antiderivative(name, (*others, *bases)) or name.startswith(OF_REACTIONS)
+        read[name] = name + SUFFIXES[kind] * bool(taken)
+        if taken and (read[name] in others or read[name] in names):
+            raise SpecificationError(
+                f"The {kind} {name!r} has the name of another signal, and {read[name]!r} is taken, too.",
+                "What is read by a name is one signal.", do="Rename one of them.", name=name, taken=read[name],
+            )  # fmt: skip
+    return read
+
+
+def meant(name, names, kind):
+    """The one of the names of a kind that a name means, where only this kind can be meant; None if there is none."""
+    suffix = SUFFIXES.get(kind, "")
+    forms = (name, f"{name}{suffix}", name.removesuffix(suffix)) if isinstance(name, str) else ()
+    return next((form for form in forms if form in names), None)
+
+
+def rows_read(rows, signals):
+    """The rows by the names under which their residuals are read beside signals: {X or X_residual: X}."""
+    return {long: row for row, long in distinct("residual", rows, signals).items()}
+
+
 def named(value, names, what):
-    """One of the names, or `NameUnknown`; `what` they name: "signal"."""
-    if not (isinstance(value, str) and value in names):
+    """The one of the names that is meant, or `NameUnknown`; `what` they name: "signal"."""
+    if (found := meant(value, names, what)) is None:
         raise unknown(value, names, what)
-    return value
+    return found
+
+
+def by_name(values, names, what, given):
+    """A dict whose keys mean some of the names, by these; `given` begins the message: "The limits"."""
+    found = {}
+    for name, value in mapping(values, given).items():
+        if (full := named(name, names, what)) in found:
+            rule, do = "What is given by name is given once.", "Leave one of them out."
+            raise SpecificationError(f"{given} have {full!r} twice, once by its short name.", rule, do=do, name=full)
+        found[full] = value
+    return found
 
 
 def as_path(value, what="The path"):
@@ -332,9 +385,7 @@ def interval(name, value, what):
 def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
     """Finite numbers by name, none below `low`: each `what` ("actuator") has a `meaning` ("lag")."""
     numbers = {}
-    for name, value in mapping(values, f"The {meaning}s").items():
-        if name not in names:
-            raise unknown(name, names, what)
+    for name, value in by_name(values, names, what, f"The {meaning}s").items():
         numbers[name] = number = finite(name, value, meaning)
         if number < low or (positive and number <= 0):
             raise SpecificationError(

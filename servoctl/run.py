@@ -1,6 +1,5 @@
 """A run: what a simulation computed, by name."""
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
@@ -9,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from servoctl import archive
-from servoctl.checks import finite, whole
+from servoctl.checks import antiderivative, finite, named, rows_read, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
 from servoctl.model.start import State, without_rounding
@@ -55,6 +54,14 @@ class Sampled(ByName, Detailed):
         name : str
         """
         return unit_of(name, self.units)
+
+    def _of_row(self, name, mechanism):
+        """The residual (N,) that is read by a name of no signal of the mechanism, or `NameUnknown`."""
+        rows = rows_read(self.residual, self.names if mechanism is None else mechanism.signals)
+        if name in rows:
+            return self.residual[rows[name]][0]
+        valid = (*self.names, *rows)
+        raise unknown(name, valid, "signal") if mechanism is None else mechanism.no("signal", name, valid)
 
     def _columns(self):
         """Times and all signals by name, and their units."""
@@ -216,18 +223,12 @@ class Run(Sampled, Value):
         if name in self.jet_names:
             return self.jets[self.jet_names.index(name)]
         if name not in self.stored:
-            groups = self._groups
-            rate, base = (0, name) if name in groups else _split(name)
-            if base not in groups:
-                raise self._no_signal(name)
-            names, values = self.signals(groups[base], rate)
+            base, rate = (name, 0) if name in self._groups else antiderivative(name, self._groups) or (None, 0)
+            if base is None:
+                return self._of_row(name, None if self.model is None else self.model.reduction.mechanism)
+            names, values = self.signals(self._groups[base], rate)
             self.stored.update(zip(names, values, strict=True))
         return self.stored[name]
-
-    def _no_signal(self, name):
-        if self.model is None:
-            return unknown(name, self.names, "signal")
-        return self.model.reduction.mechanism.no("signal", name, self.names)
 
     def signals(self, kind, rate=0):
         """Names and (n, N) values of one of the model's groups of signals, or of their time derivatives.
@@ -501,12 +502,6 @@ def range_in_words(name, low, t_low, high, t_high, unit):
     return f"  {name}: {low} throughout" if low == high else f"  {name}: {low}{at_low} .. {high}{at_high}"
 
 
-def _split(name):
-    """The order k and the rest of a name d..., d2..., d3...; 0 and the name itself if it is no derivative."""
-    derivative = re.fullmatch(r"d([2-9]|[1-9]\d+)?(\D.*)", name) if isinstance(name, str) else None
-    return (int(derivative[1] or 1), derivative[2]) if derivative else (0, name)
-
-
 class _Residuals(Mapping):
     """Residuals by name, computed at the first access."""
 
@@ -527,11 +522,8 @@ class _Residuals(Mapping):
 
     def __getitem__(self, name):
         stored = self._run.stored_residual
-        if not isinstance(name, str):
-            raise unknown(name, self._names(), "residual")
+        name = named(name, self._names(), "residual")
         if name not in stored:
-            if name not in self._names():
-                raise unknown(name, self._names(), "residual")
             levels, values = self._run.signals("residuals")
             rows, names = list(dict.fromkeys(level[0] for level in levels)), self._names()
             # Near an instant other balances may take the places of the model's hidden ones, and have their names here.

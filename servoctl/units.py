@@ -2,8 +2,8 @@
 
 import re
 
-from servoctl.checks import as_list, mapping
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import antiderivative, as_list, by_name, mapping
+from servoctl.errors import SpecificationError
 
 FORCES = {"m": "N", "rad": "N m", "m/s": "N", "rad/s": "N m"}  # unit of a position or a velocity: of its force
 OF_LOOP = ("command ", "input ", "measured ")  # how names of a loop's signals begin in a plain run
@@ -30,11 +30,7 @@ def units_by_name(units, names, what):
     """
     listed = units.split() if isinstance(units, str) else as_list(units)
     if listed is None:
-        named = as_units(units)
-        for name in named:
-            if name not in names:
-                raise unknown(name, names, what)
-        return dict(named)
+        return by_name(as_units(units), names, what, "The units")
     if len(listed) != len(names):
         raise SpecificationError(
             f"{len(listed)} units were given: {' '.join(map(str, listed))[:150]}.",
@@ -81,12 +77,6 @@ def unit_of_column(name, units):
         return units.get(name, "")
     of = OF_NUMBERS.fullmatch(name)
     return unit_of(next(filter(None, of.groups())) if of else name, units)
-
-
-def antiderivative(name, names):
-    """(q, k) of the k-th derivative of a signal, or None."""
-    match = re.fullmatch(r"d(\d*)(.+)", name)
-    return (match[2], int(match[1] or 1)) if match and match[2] in names else None
 
 
 def with_unit(name, unit):

@@ -252,7 +252,7 @@ def test_poles_of_the_closed_loop_are_those_of_the_gains(plan):
     radius = np.abs(loop.poles()).max()
     assert isinstance(loop, control.StateSpace) and loop.dt == 1 / 50.0
     assert radius == pytest.approx(law.info["spectral radius at its end"], rel=1e-6) and radius < 1
-    assert "plant_theta" in loop.state_labels and "law_integral of X" in loop.state_labels
+    assert "plant_theta" in loop.state_labels and "law_integral of X_residual" in loop.state_labels
     assert {"disturbance theta", "noise x"} <= set(loop.input_labels)
     at_rest = loop.dcgain()[:, loop.input_labels.index("disturbance theta")]
     x, theta = (at_rest[loop.output_labels.index(name)] for name in ("x", "theta"))

@@ -47,16 +47,16 @@ def test_the_integral_of_the_program_takes_it_back(plan, varying):
     law = sv.lqr(plan, sv.plant(CRANE), integral=1e4, varying=varying, **WEIGHTS)
     worst, at_6, at_8 = heavier(plan, law)
     assert worst <= 0.060 and at_6 <= 0.010 and at_8 <= 0.003
-    assert law.state_names == ("integral of X", "integral of Z")
+    assert law.state_names == ("integral of X_residual", "integral of Z_residual")  # X and Z are outputs
 
 
-HELD = {"x": 1e4, "Z": 1e4}
+HELD = {"x": 1e4, "Z_residual": 1e4}
 
 
 def test_the_trolley_is_held_under_steady_wind_that_moves_the_load(plan):
     plant, wind = sv.plant(CRANE), -80.0
     law = sv.lqr(plan, plant, integral=HELD)
-    assert law.state_names == ("integral of Z", "integral of x")
+    assert law.state_names == ("integral of Z_residual", "integral of x")
     noisy = sv.output_feedback(law, plant, {"x": 1e-3, "l": 1e-3, "theta": 1e-3}, process=dict.fromkeys("xl", 1e-2))
     bounded = sv.limited(law, sv.plant(CRANE, limits={"trolley": 400.0, "hoist": (-3000.0, 0.0)}))
     leaning = np.arcsin(wind / (100.0 * 9.81 * 2.0))
@@ -95,7 +95,7 @@ def test_the_integral_of_an_output_is_that_of_the_residual_about_the_same_path()
 
 def test_defaults_are_the_weights_of_the_design(plan):
     plain = sv.lqr(plan, sv.plant(CRANE), integral=True)
-    said = sv.lqr(plan, sv.plant(CRANE), integral={"X": 1e4, "Z": 1e4}, **WEIGHTS)
+    said = sv.lqr(plan, sv.plant(CRANE), integral={"X_residual": 1e4, "Z_residual": 1e4}, **WEIGHTS)
     named = sv.lqr(plan, sv.plant(CRANE), Q={"theta": 1e3}, R={"hoist": 1e-3}, integral=[1e4, 1e4])
     assert np.array_equal(plain.schedule, said.schedule) and np.array_equal(plain.schedule, named.schedule)
 

@@ -200,7 +200,7 @@ def test_the_key_holds_all_that_a_derivation_reads():
                 if owner in read:
                     read[owner].add(node.attr)
     # `as_text` holds them; `mass` is the Jacobian of `balance`; `whole` is derived by itself; the others are names
-    read["mechanism"] -= {"as_text", "whole", "left_out", "no"}
+    read["mechanism"] -= {"as_text", "whole", "left_out", "no", "signals", "longer"}
     read["program"] -= {"again"}
     assert read == told
 

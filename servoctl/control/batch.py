@@ -105,7 +105,7 @@ def _signals(plant, residuals, t, x, p):
     """Residuals, and the largest share of its terms that an entry left out by eliminations has."""
     phi, entries = ca.SX(0, 1), plant.equations.dropped
     if residuals:
-        places = [plant.mechanism.parameters.names.index(s.name()) for s in residuals.symbols]
+        places = [plant.mechanism.parameters.names.index(name) for name in residuals.parameter_names]
         # a single parameter indexed by [] is a row in CasADi, not a column
         numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in places))
         phi = residuals.expression(t, x, plant.state_names, numbers)

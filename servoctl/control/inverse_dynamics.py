@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_complex, is_number, positive, whole
+from servoctl.checks import as_complex, by_name, is_number, positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plan
 from servoctl.control.residuals import in_symbols_of
 from servoctl.control.sampling import sampled_radii
-from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics, unknown
+from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics
 from servoctl.growth import internal_dynamics
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.methods.stability import sampled_bound
@@ -451,10 +451,7 @@ def _poles(poles, orders):
             do="Pass {" + ", ".join(f"{name!r}: {order} poles" for name, order in orders.items()) + "}.",
             orders=orders,
         )
-    for name in poles:
-        if name not in orders:
-            raise unknown(name, orders, "residual")
-    by_residual = {}
+    poles, by_residual = by_name(poles, orders, "residual", "The poles"), {}
     for name, order in orders.items():
         values = as_complex(poles.get(name, ()))
         if values.shape != (order,) or not np.isfinite(values).all() or not _paired(values):

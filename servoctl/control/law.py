@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import ON_SAMPLE, finite, positive, require_kind
+from servoctl.checks import ON_SAMPLE, finite, meant, named, positive, require_kind
 from servoctl.codegen.function import Compiled
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
 from servoctl.run import Run
 from servoctl.values import Value, frozen
@@ -338,12 +338,10 @@ def ordered(values, names, what, exactly=True):
     """
     numbers = values
     if isinstance(values, dict):
-        for name in values if exactly else ():
-            if name not in names:
-                raise unknown(name, names, what)
+        if exactly:
+            values = {meant(n, names, "actuator") or named(n, names, what): value for n, value in values.items()}
         for name in names:
-            if name not in values:
-                raise unknown(name, values, what)
+            named(name, values, what)
         numbers = [values[name] for name in names]
     try:
         entries = np.asarray(numbers).ravel()

@@ -23,7 +23,7 @@ from servoctl.control.residuals import Residuals, in_symbols_of, program_residua
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
-from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.jets.branches import cse
 from servoctl.markup import Shown
 from servoctl.plants.plant import Plant
@@ -195,8 +195,7 @@ def _bounds(plant, bounds):
         )
     known = plant.mechanism.outputs | (plant.equations.multipliers if bounds else {})
     for one in (one for combination, _ in parts.values() for one in combination):
-        if one not in known:
-            raise unknown(one, known, "output or multiplier")
+        named(one, known, "output or multiplier")
     rows = {name: sum(c * known[one] for one, c in combination.items()) for name, (combination, _) in parts.items()}
     effects = Effects(plant, rows)
     for name in bounds:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_numbers, numbers_by_name
+from servoctl.checks import as_numbers, numbers_by_name, rows_read
 from servoctl.codegen.matrices import riccati
 from servoctl.control.feedback import StateFeedback, affine
 from servoctl.control.law import Law
@@ -61,8 +61,8 @@ def lqr(
     integral : bool, float, dict of str to float, or (k,) array, optional
         Weights of the integrals of the program's residuals, by residual; they remove the error that a constant mismatch
         or disturbance leaves. True: 1e4 each, so that an error of 3 mm that lasts for 1 s costs as much as 1 cm of
-        error. An output of the mechanism, or a state, is also named: the deviation from its value along the plan is
-        integrated. Default: none.
+        error. Of an output of the mechanism, or a state, the deviation from its value along the plan is integrated; a
+        residual with the name of one is NAME_residual. Default: none.
     varying : bool
         False: frozen-time gains.
 
@@ -330,7 +330,9 @@ def _integrals(integral, plan, plant):
     integral = bool(integral) if isinstance(integral, np.bool_) else integral
     if integral is None or integral is False or (isinstance(integral, dict) and not integral):
         return None, None
-    residuals = Residuals(plan.model, plant, tuple(integral) if isinstance(integral, dict) else None)
+    rows, signals = Residuals(plan.model, plant).names, plan.model.reduction.mechanism.signals
+    names = integral if isinstance(integral, dict) else rows_read(rows, signals)
+    residuals = Residuals(plan.model, plant, tuple(names))
     if not residuals.names:
         raise SpecificationError(
             "The program has no residual of order 0 or 1.",

@@ -5,8 +5,8 @@ from math import factorial, perm
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, positive, require_memory
-from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
+from servoctl.checks import ON_SAMPLE, named, positive, require_memory
+from servoctl.errors import NotRealisable, ServoError, SpecificationError
 from servoctl.plants.plant import Plant, part_of
 
 DISTINCT = 1e-6  # of the mean distance of samples: between nearer ones polynomials are rounding
@@ -174,8 +174,7 @@ def require_plan(plan, plant):
         (plant.inputs, model.actuators, "actuator of the plan"),
     ):
         for name in names:
-            if name not in valid:
-                raise unknown(name, valid, what)
+            named(name, valid, what)
 
 
 def resampled(plan, times):

@@ -5,6 +5,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import named, rows_read
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.branches import cse
@@ -18,8 +19,8 @@ class Residuals:
 
     Attributes
     ----------
-    names, orders : tuple
-        Names and orders of the residuals.
+    names, orders, parameter_names : tuple
+        Names and orders of the residuals, and names of the plant's parameters on which they depend.
     expressions, symbols : SX, list of SX
         The residuals, and the parameters on which they depend; values along the plan are the last of them.
     parameters : (n_p,) array
@@ -32,12 +33,13 @@ class Residuals:
 
     def __init__(self, model, plant, names=None, order=1):
         mechanism, residuals = model.reduction.mechanism, program_residuals(model)
-        self._q = mechanism.q
-        values = {name: e for name, e in _planned(mechanism).items() if name in (names or ()) and name not in residuals}
-        along = {name: ca.SX.sym(f"plan {name}") for name in values}
-        residuals = residuals | {name: value - along[name] for name, value in values.items()}
+        self._q, planned, along = mechanism.q, _planned(mechanism), {}
+        if names is not None:  # which are signals, or else rows
+            along = {name: ca.SX.sym(f"plan {name}") for name in planned if name in names}
+            rows = {name: residuals[row] for name, row in rows_read(residuals, mechanism.signals).items()}
+            valid = {name: self._q.order(e) for name, e in (rows | planned).items()}
+            residuals = {name: (rows | planned)[name] - along.get(name, 0) for name in valid if name in names}
         orders = {name: self._q.order(e) for name, e in residuals.items()}
-        valid = {name: self._q.order(e) for name, e in (residuals | _planned(mechanism)).items()} if names else {}
         for name in names or ():
             if name not in orders:
                 raise unknown(name, valid, "residual, output or state")
@@ -50,21 +52,20 @@ class Residuals:
                     name=name,
                     order=orders[name],
                 )
-        self.names = tuple(name for name in orders if orders[name] <= order and (names is None or name in names))
+        self.names = tuple(name for name in orders if orders[name] <= order)
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         self.expressions = ca.vertcat(*(residuals[name] for name in self.names))
         numbers = dict(zip(plant.mechanism.parameters.names, plant.parameters.tolist(), strict=False))
         self.symbols = [s for s in mechanism.parameters.symbols if _depends(self.expressions, s)]
-        for s in self.symbols:
-            if s.name() not in numbers:
-                raise unknown(s.name(), numbers, "parameter of the plant")
+        self.parameter_names = tuple(map(mechanism.parameters.name_of, self.symbols))
+        for name in self.parameter_names:
+            named(name, numbers, "parameter of the plant")
         self.planned = tuple(along)
-        self.parameters = np.array([numbers[s.name()] for s in self.symbols] + [0.0] * len(along))
+        self.parameters = np.array([numbers[name] for name in self.parameter_names] + [0.0] * len(along))
         self.symbols = [*self.symbols, *along.values()]
         self.measures = tuple(s.name() for s in self._states(self.expressions))
         for name in self.measures:
-            if name not in plant.state_names:
-                raise unknown(name, plant.state_names, "state of the plant")
+            named(name, plant.state_names, "state of the plant")
         self._plant, self._order = plant, order
         self._built = {}
 
@@ -154,15 +155,15 @@ def in_symbols_of(plant, model, expressions=None):
     expressions = program_residuals(model) if expressions is None else expressions
     if mechanism.q is plant.mechanism.q and mechanism.parameters is plant.mechanism.parameters:
         return dict(expressions)
-    new = {symbol.name(): symbol for symbol in _symbols(plant.mechanism)}
-    old = [symbol for symbol in _symbols(mechanism) if symbol.name() in new]
-    values = ca.vertcat(*(new[symbol.name()] for symbol in old))
-    return {name: ca.substitute(e, ca.vertcat(*old), values) for name, e in expressions.items()}
+    new, old = _symbols(plant.mechanism), _symbols(mechanism)
+    both = [name for name in old if name in new]
+    old, new = (ca.vertcat(*(symbols[name] for name in both)) for symbols in (old, new))
+    return {name: ca.substitute(e, old, new) for name, e in expressions.items()}
 
 
 def _symbols(mechanism):
-    q = mechanism.q
-    return [q.t, *q, *q.gamma(1), *q.gamma(2), *mechanism.parameters.symbols]
+    q, p = mechanism.q, mechanism.parameters
+    return {s.name(): s for s in (q.t, *q, *q.gamma(1), *q.gamma(2))} | dict(zip(p.names, p.symbols, strict=True))
 
 
 def _depends(expression, symbol):

@@ -13,7 +13,7 @@ from servoctl.control.law import Law, UserStep
 from servoctl.control.loop import Loop
 from servoctl.control.reference import resampled
 from servoctl.control.residuals import known_residuals
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 from servoctl.markup import fitted, listed
 from servoctl.model.start import without_rounding
 from servoctl.plants.plant import Plant
@@ -105,7 +105,7 @@ class Closed(Sampled, Value):
         for kind, names in self._kinds.items():
             if name in names:
                 return self._evaluated(kind)[names.index(name)]
-        raise unknown(name, self.names, "signal")
+        return self._of_row(name, self.plant.mechanism)
 
     @cached_property
     def _evaluations(self):

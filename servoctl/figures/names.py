@@ -2,10 +2,10 @@
 
 import re
 
-from servoctl.checks import require_kind
+from servoctl.checks import antiderivative, require_kind
 from servoctl.figures import style
 from servoctl.run import Run
-from servoctl.units import antiderivative, as_units, unit_of
+from servoctl.units import as_units, unit_of
 
 
 def efforts(run):

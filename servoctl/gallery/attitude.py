@@ -90,10 +90,10 @@ def tumbling_satellite(decay=0.1, weights="inertia"):
         q,
         gibbs=ca.dot(dw, J * dw) / 2 + ca.dot(dw, ca.cross(w, momentum)),  # (3.11)
         actuators={f"torque{i + 1}": ca.SX.eye(3)[:, i] for i in range(3)},
-        outputs=outputs | {"energy": energy},
+        outputs=outputs,
         shapes={f"axis {i + 1}": [(0, 0, 0), 0.6 * axle] for i, axle in enumerate(ca.horzsplit(axes))}
         | {"pointer": [1.2 * axes[:, 2]]},
-        units=dict.fromkeys(q.velocity_names, "rad/s") | dict.fromkeys(outputs, "N m s") | {"energy": "J"},
+        units=dict.fromkeys(q.velocity_names, "rad/s") | dict.fromkeys(outputs, "N m s"),
         parameters=p,
     )
     return mechanism, sv.Program({"energy": energy - p.E * ca.exp(-2 * p.decay * q.t)}, weights=weights)

@@ -200,7 +200,7 @@ def loop_gain(plant, law, at):
             plant_dt=plant.dt,
             law_dt=law.dt,
         )
-    named(at, law.output_labels, "actuator")
+    at = named(at, law.output_labels, "actuator")
     plant, law = plant.copy("plant", use_prefix_suffix=False), law.copy("law", use_prefix_suffix=False)
     wires = [[f"plant.{a}", f"law.{a}"] for a in law.output_labels if a != at]
     wires += [[f"law.{y}", f"plant.{y}"] for y in law.input_labels]

@@ -7,14 +7,13 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_span, interval, mapping, numbers_by_name, positive_number, require_kind
+from servoctl.checks import as_span, by_name, interval, mapping, numbers_by_name, positive_number, require_kind
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
     ServoError,
     SingularProgram,
     SpecificationError,
-    unknown,
 )
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
@@ -235,9 +234,7 @@ def _no_plan(why, error):
 def _ranges(mechanism, limits, bounds):
     """Limits of actuators and their rates, and bounds of other signals, {name: (low, high)} each."""
     actuators = [*mechanism.actuators, *(f"d{name}" for name in mechanism.actuators)]
-    for name in mapping(limits, "The limits"):
-        if name not in actuators:
-            raise unknown(name, actuators, "actuator or rate")
+    limits = by_name(limits, actuators, "actuator or rate", "The limits")
     return tuple(
         {name: interval(name, value, what) for name, value in mapping(values, f"The {what}s").items()}
         for values, what in ((limits, "limit"), (bounds, "bound"))

@@ -17,9 +17,9 @@ from dataclasses import field, replace
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_list, finite, interval, mapping, named, numbers_by_name, require_kind, texts
+from servoctl.checks import as_list, by_name, finite, interval, mapping, named, numbers_by_name, require_kind, texts
 from servoctl.control.time_law import REACHED
-from servoctl.errors import LimitExceeded, ServoError, SpecificationError, UnstableInternalDynamics, unknown
+from servoctl.errors import LimitExceeded, ServoError, SpecificationError, UnstableInternalDynamics
 from servoctl.growth import internal_dynamics
 from servoctl.inversion.report import extremes
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
@@ -182,13 +182,14 @@ def design(
 
 def _varied(model, vary):
     """The ranges of parameters by name, (low, high)."""
-    if not mapping(vary, "The parameters that are varied"):
+    vary = by_name(vary, model.numbers, "parameter", "The parameters that are varied")
+    if not vary:
         raise SpecificationError(
             "No parameters are varied.", "A design has at least one.", do='Name some, as {"via_x": (1.0, 4.0)}.'
         )
     ranges, numbers = {name: interval(name, value, "range") for name, value in vary.items()}, model.numbers
     for name, (low, high) in ranges.items():
-        number = numbers[named(name, numbers, "parameter")]
+        number = numbers[name]
         if not np.isfinite([low, high]).all():
             raise SpecificationError(
                 f"The range of {name!r} is ({low:g}, {high:g}).", "A range has two finite ends.", name=name
@@ -218,8 +219,7 @@ def _limited(model, limits):
     """(low, high) by signal."""
     known = (*model.jet_names, *model.signal_groups)
     for name in mapping(limits, "The limits"):
-        if name not in known:
-            raise unknown(name, known, "signal")
+        named(name, known, "signal")
     return {name: interval(name, value, "limit") for name, value in (limits or {}).items()}
 
 
@@ -233,7 +233,8 @@ def _span(model, t_span, ranges):
     t0, end = finite("t0", ends[0], "begin of the span"), ends[1]
     end = end if isinstance(end, ca.SX) and end.is_scalar() else ca.SX(finite("t1", end, "end of the span"))
     symbols, numbers = ca.symvar(end), model.numbers
-    names = [named(s.name(), numbers, "parameter") for s in symbols]
+    name_of = model.reduction.mechanism.parameters.name_of
+    names = [named(name_of(s) or s.name(), numbers, "parameter") for s in symbols]
     inputs = {name: ca.SX.sym(name) for name in numbers}
     end = ca.substitute([end], symbols, [inputs[name] for name in names])[0]
     slopes = ca.jacobian(end, ca.vertcat(*(inputs[name] for name in ranges)))

@@ -18,8 +18,8 @@ from servoctl.checks import (
     array_of,
     as_list,
     as_span,
+    by_name,
     interval,
-    mapping,
     positive_number,
     positives,
     require_kind,
@@ -28,7 +28,6 @@ from servoctl.errors import (
     IntegrationStopped,
     LimitExceeded,
     SpecificationError,
-    unknown,
 )
 from servoctl.inversion.transcription import LONGEST, Mesh, Transcription
 from servoctl.inversion.transfer import EXCEEDED, GUESS, Transfer, state_sizes
@@ -122,7 +121,7 @@ def relaxed(
     """
     require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
     require_kind(Program, "program", program, "sv.Program({...})")
-    require_parts(plant.mechanism, program, {})
+    program = require_parts(plant.mechanism, program, {})
     named = [name for given in (start, end, limits, plant.limits, bounds) for name in names_of(given)]
     plant = part_of(plant, needed(plant.mechanism, program, named=named))
     limits = _all_limits(plant, limits)
@@ -140,9 +139,7 @@ def _weights(weight, program):
         return None
     if not isinstance(weight, Mapping):
         return np.full(len(program.names), positive_number("weight", weight))
-    for name in weight:
-        if name not in program.names:
-            raise unknown(name, program.names, "residual")
+    weight = by_name(weight, program.names, "residual", "The weights")
     for name in program.names:
         if name not in weight:
             raise SpecificationError(
@@ -156,9 +153,7 @@ def _all_limits(plant, limits):
     magnitudes = dict(plant.limits)
     rates = {name: (-rate, rate) for name, rate in plant.rate_limits.items()}
     names = {name: (magnitudes, name) for name in plant.inputs} | {f"d{name}": (rates, name) for name in plant.inputs}
-    for name, value in mapping(limits, "The limits").items():
-        if name not in names:
-            raise unknown(name, names, "actuator or rate")
+    for name, value in by_name(limits, names, "actuator or rate", "The limits").items():
         sides, actuator = names[name]
         low, high = interval(name, value, "limit")
         before = sides.get(actuator, (-np.inf, np.inf))
@@ -432,8 +427,7 @@ class Relaxation(Transfer):
         """How far samples between the instants of bounds exceed these, for the message; "" if they do not."""
         text = ""
         for name, (low, high) in self.bounds.items():
-            values = run.residual[name][0] if name in self.program.names else run[name]
-            excess = float(np.max(np.maximum(low - values, values - high)))
+            excess = float(np.max(np.maximum(low - run[name], run[name] - high)))
             if excess > EXCEEDED * max(abs(side) for side in (low, high) if np.isfinite(side)):
                 text += f"; between its instants {name} exceeds its bound by {excess:.2g}"
         return text

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from servoctl.checks import interval, mapping
-from servoctl.errors import NotRealisable, SpecificationError, unknown
+from servoctl.checks import by_name, interval
+from servoctl.errors import NotRealisable, SpecificationError
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
 from servoctl.markup import Detailed, fitted, listed
@@ -236,9 +236,10 @@ def report(
         except NotRealisable as error:
             return _not_realisable(model, run, error)
     model = _require_motion(model, run)
-    limits = {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()}
+    limits = by_name(limits, model.actuators, "actuator", "The limits")
+    limits = {name: interval(name, value, "limit") for name, value in limits.items()}
     along = run if isinstance(run, Run) else None
-    _require_limits(model, along, limits)
+    _require_limits(along, limits)
     judged, structure, ends = verdict(model, run), model.structure(), endpoints(model, run)
     margin, ranks = _ranks(model, structure, along, ends)
     return Report(
@@ -281,10 +282,7 @@ def _require_motion(model, run):
     return model if run is None else require_model(model, motion, "report")
 
 
-def _require_limits(model, run, limits):
-    for name in limits:
-        if name not in model.actuators:
-            raise unknown(name, model.actuators, "actuator")
+def _require_limits(run, limits):
     if limits and run is None:
         raise SpecificationError(
             f"Limits of {', '.join(limits)} were given without a run.",

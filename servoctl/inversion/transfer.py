@@ -6,7 +6,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, interval, mapping, numbers_by_name
+from servoctl.checks import finite, interval, mapping, named, numbers_by_name, rows_read
 from servoctl.errors import InconsistentStart, LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.inversion.transcription import Node
 from servoctl.methods.bounded import End, FreeEntries
@@ -85,7 +85,8 @@ class Transfer:
         """Bounded quantities as expressions."""
         mechanism, q = self.plant.mechanism, self.plant.mechanism.q
         jets = {name: s for k in range(3) for name, s in zip(q.jet_names(k), ca.vertsplit(q.jet(k)), strict=True)}
-        known = jets | self.program.residuals | mechanism.outputs
+        rows = rows_read(self.program.residuals, mechanism.signals)
+        known = jets | mechanism.outputs | {name: self.program.residuals[row] for name, row in rows.items()}
         for name in self.bounds:
             if name in (*self.plant.inputs, *(f"d{u}" for u in self.plant.inputs)):
                 raise SpecificationError(
@@ -183,8 +184,7 @@ class Transfer:
             return open_, None, None
         if isinstance(self.end, Mapping):
             for name, value in self.end.items():
-                if name not in self.plant.state_names:
-                    raise unknown(name, self.plant.state_names, "state")
+                named(name, self.plant.state_names, "state")
                 open_[self.plant.state_names.index(name)] = finite(name, value, "value at the end")
             return open_, None, None
         if isinstance(self.end, str) and self.end == "bounded":

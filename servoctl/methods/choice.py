@@ -7,6 +7,7 @@ import numpy as np
 from servoctl.checks import (
     MOST_JETS,
     as_complex,
+    by_name,
     is_number,
     is_whole,
     mapping,
@@ -70,10 +71,8 @@ class Poles:
         """The poles [1/s] of every row of a model: {row name: (ρ,) array}."""
         if isinstance(self.values, float):
             return {row: np.full(count, -1.0 / self.values) for row, count in model.raised.items()}
-        for name in self.values:
-            if name not in model.raised:
-                raise unknown(name, model.raised, "row")
-        poles = {row: np.atleast_1d(self.values.get(row, np.zeros(rho))) for row, rho in model.raised.items()}
+        values = by_name(self.values, model.raised, "row", "The poles")
+        poles = {row: np.atleast_1d(values.get(row, np.zeros(rho))) for row, rho in model.raised.items()}
         for row, rho in model.raised.items():
             if len(poles[row]) != rho:
                 raise SpecificationError(

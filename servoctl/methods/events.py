@@ -24,8 +24,8 @@ class Event:
     Parameters
     ----------
     signal : str or callable
-        Name of a coordinate, a derivative, an actuation, an output, a residual; or a function event(t, x) of the time
-        [s] and the state (n_x,), in the order of `model.state_names`.
+        Name of a coordinate, a derivative, an actuation, an output, a residual, as of `run[name]`; or a function
+        event(t, x) of the time [s] and the state (n_x,), in the order of `model.state_names`.
     value : float
         Which it crosses, in its unit.
     terminal : bool or int
@@ -66,8 +66,7 @@ class Event:
     def along(self, run):
         """The signal less the value at the samples of a run, (N,)."""
         if isinstance(self.signal, str):
-            residual = self.signal in run.model.residual_names
-            values = run.residual[self.signal][0] if residual else run[self.signal]
+            values = run[self.signal]
         else:
             states = run.jets[: len(run.model.state_names)].T
             values = np.array([self._called(t, x) for t, x in zip(run.t, states, strict=True)])
@@ -274,8 +273,6 @@ def _require_signal(event, model):
         return
     size = len(model.jet_names)
     empty = Run(np.zeros(1), np.full((size, 1), np.nan), model.jet_names, model)
-    if event.signal in model.residual_names:
-        return
     try:
         empty[event.signal]
     except SpecificationError as error:

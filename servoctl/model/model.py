@@ -8,9 +8,9 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import MOST_JETS, as_numbers, finite, mapping, named, whole
+from servoctl.checks import MOST_JETS, as_numbers, by_name, finite, mapping, named, whole
 from servoctl.codegen.function import Compiled, compiled
-from servoctl.errors import ServoError, SingularProgram, SpecificationError, unknown
+from servoctl.errors import ServoError, SingularProgram, SpecificationError
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
 from servoctl.markup import Detailed
@@ -207,9 +207,7 @@ class Model(Detailed):
         """
         r = self.reduction
         current = self.numbers
-        for name in changes:
-            if name not in current:
-                raise unknown(name, list(current), "parameter")
+        changes = by_name(changes, current, "parameter", "The parameters")
         values = r.mechanism.parameters.values({**current, **changes})
         if not affirmed(self, values):
             require_positive(r.mechanism, replace(r.points, values=values))

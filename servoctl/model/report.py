@@ -1,9 +1,11 @@
 """The printed form of a model, and what is said of a state at which its program is singular."""
 
 import warnings
+from math import inf
 
 import numpy as np
 
+from servoctl.checks import distinct
 from servoctl.errors import ServoError, SingularProgram
 from servoctl.markup import fitted, listed
 from servoctl.model.rest import first_motion, standstill_near
@@ -15,7 +17,7 @@ LARGEST_EXPLAINED = 20_000  # operations of the accelerations, beyond which rela
 
 def describe(model, full):
     """The lines of a printed model: what was done to the specification; if full, with what the derivation rests on."""
-    r, rows = model.reduction, (_title, _left_out, _raised, _hidden, _free, _chosen, _switches)
+    r, rows = model.reduction, (_title, _longer, _left_out, _raised, _hidden, _free, _chosen, _switches)
     texts = [fitted(lambda room, row=row: row(model, r, room), full) for row in rows]
     return "\n  ".join(filter(None, [*texts, *(_derivation(r) if full else ())])).splitlines()
 
@@ -27,6 +29,17 @@ def _title(model, r, room):
     several = "s" * (len(actuators) != 1)
     by = "an ideal reaction" if program.by == "ideal" else f"the actuator{several} {listed(actuators, room)}"
     return f"Model: {names} under the program {listed(program.residuals, room)}; realised by {by}"
+
+
+def _longer(model, r, room):
+    """The longer names of what would else bear the name of a coordinate or another signal.
+
+    A residual of an output, as X - path of X, is expected, and has its line in the details alone.
+    """
+    read = distinct("residual", r.original, r.mechanism.signals)
+    told = [name for name in read if room == inf or name not in r.mechanism.outputs]
+    names = [*(read[name] for name in told if read[name] != name), *r.mechanism.longer]
+    return f"longer names, as other signals have the short ones: {listed(names, room)}" * bool(names)
 
 
 def _left_out(model, r, room):

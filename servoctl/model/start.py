@@ -8,8 +8,8 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, mapping
-from servoctl.errors import InconsistentStart, ServoError, SpecificationError, unknown
+from servoctl.checks import column, finite, mapping, named
+from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
 from servoctl.model.rests import GUESSED, Rests
@@ -69,8 +69,7 @@ class State(Value, Shown):
     branches: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def __getitem__(self, name):
-        if name not in self.names:
-            raise unknown(name, self.names, "state")
+        named(name, self.names, "state")
         return float(self.values[self.names.index(name)])
 
     def __repr__(self):

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import casadi as ca
 
-from servoctl.checks import column, mapping
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import by_name, column
+from servoctl.errors import SpecificationError
 from servoctl.jets.overflow import settled
 from servoctl.model.model import derive
 from servoctl.plants.equations import plant_equations
@@ -46,10 +46,8 @@ def driven(plant, inputs=None, residuals=None):
                 name=what,
                 value=value,
             )
-    mechanism, t, values = plant.mechanism, plant.mechanism.q.t, mapping(inputs, "The inputs")
-    for name in values:
-        if name not in plant.inputs:
-            raise unknown(name, plant.inputs, "actuator")
+    mechanism, t = plant.mechanism, plant.mechanism.q.t
+    values = by_name(inputs, plant.inputs, "actuator", "The inputs")
     expressions = {name: _expression(name, values.get(name, 0.0), t) for name in plant.inputs}
     for name, (low, high) in plant.limits.items():
         expressions[name] = ca.fmin(ca.fmax(expressions[name], low), high)

@@ -8,6 +8,7 @@ import numpy as np
 from servoctl.checks import (
     array_of,
     as_numbers,
+    by_name,
     column,
     finite,
     interval,
@@ -17,7 +18,7 @@ from servoctl.checks import (
     require_kind,
 )
 from servoctl.codegen.function import compiled
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 from servoctl.jets.overflow import settled
 from servoctl.markup import Shown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
@@ -344,8 +345,7 @@ class Plant(Value, Shown):
         values = getattr(values, "values", values) if not isinstance(values, dict) else values
         if isinstance(values, dict):
             for name in values:
-                if name not in names:
-                    raise unknown(name, names, "state")
+                named(name, names, "state")
             missing = [name for name in names[:n] if name not in values]
             if missing:
                 raise SpecificationError(
@@ -397,10 +397,7 @@ def _text(values):
 
 
 def _limits(limits, actuators):
-    limits = mapping(limits, "The limits")
-    for name in limits:
-        if name not in actuators:
-            raise unknown(name, actuators, "actuator")
+    limits = by_name(limits, actuators, "actuator", "The limits")
     return {name: interval(name, value, "limit") for name, value in limits.items()}
 
 
@@ -408,8 +405,7 @@ def _forces(mechanism, forces, names):
     """Further generalised forces (n,) as a serialised function; "" for none."""
     q, total = mechanism.q, ca.SX.zeros(mechanism.q.n)
     for name, value in mapping(forces, "The forces").items():
-        if name not in names:
-            raise unknown(name, names, "coordinate" if q.plain else "quasi-velocity")
+        named(name, names, "coordinate" if q.plain else "quasi-velocity")
         (expression,) = settled(column(value, f"the force on {name!r}", 1))
         require_known(expression, mechanism, f"the force on {name!r}")
         if q.order(expression) > 1:

@@ -147,8 +147,8 @@ def require_positive(mechanism, points):
     k = int(np.argmin(values[:, 0]))
     direction = np.abs(directions[k, :, 0])
     names = [mechanism.q.jet_names(1)[i] for i in np.flatnonzero(direction > NAMED * direction.max())]
-    parameters = zip(points.parameters, points.values, strict=True)
-    negative = {symbol.name(): float(value) for symbol, value in parameters if value < 0}
+    parameters = zip(mechanism.parameters.names, points.values, strict=True)
+    negative = {name: float(value) for name, value in parameters if value < 0}
     listed = ", ".join(f"{name} = {value:g}" for name, value in negative.items())
     raise SpecificationError(
         f"The mass matrix is negative in a direction of {', '.join(names)}"

@@ -7,8 +7,8 @@ from itertools import chain
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, mapping
-from servoctl.errors import NotRealisable, ServoError, SpecificationError, unknown
+from servoctl.checks import by_name, distinct, finite, mapping, named
+from servoctl.errors import NotRealisable, ServoError, SpecificationError
 from servoctl.jets.branches import cse
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
@@ -225,7 +225,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     SpecificationError, NotRealisable, SingularProgram, InconsistentStart
         See `hidden.complete` and `appell.realisation`.
     """
-    require_parts(mechanism, program, guess)
+    program = require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.force_names
     balance = wished_balance(mechanism, program)
@@ -322,7 +322,7 @@ def strong(pivots, before):
 
 
 def require_parts(mechanism, program, guess):
-    """Refuse what is no mechanism or no program, unknown symbols, names that differ not, and unknown guesses."""
+    """The program by the mechanism's names; refuse what is none, unknown symbols, equal names, and unknown guesses."""
     for value, kind in ((mechanism, Mechanism), (program, Program)):
         if not isinstance(value, kind):
             raise SpecificationError(
@@ -335,8 +335,9 @@ def require_parts(mechanism, program, guess):
     q, guess = mechanism.q, mapping(guess, "The guesses")
     for name, expression in program.residuals.items():
         require_known(expression, mechanism, f"the residual {name!r}")
-    for what, chosen in (("weight", program.weights), ("wish", program.toward)):
-        for name, expression in chosen.items():
+    chosen = {"weight": program.weights, "wish": program.toward}
+    for what, values in chosen.items():
+        for name, expression in values.items():
             require_known(ca.SX(expression), mechanism, f"the {what} of {name!r}")
     twice = [name for name in program.residuals if name in mechanism.constraints]
     if twice:
@@ -348,9 +349,11 @@ def require_parts(mechanism, program, guess):
         )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
     for name, value in guess.items():
-        if name not in known:
-            raise unknown(name, known, "coordinate or derivative")
+        named(name, known, "coordinate or derivative")
         finite(name, value)
+    distinct("residual", (*program.residuals, *mechanism.constraints), mechanism.signals)  # refuses ambiguous names
+    full = [by_name(values, mechanism.actuators, "actuator", f"The {what}s") for what, values in chosen.items()]
+    return program.again(program.with_turns, *full) if full != [*chosen.values()] else program
 
 
 def _constraints(mechanism, program, original, context):

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_list, column, finite, mapping, named, texts
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 from servoctl.robots.description import described
 from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
 from servoctl.robots.inertia import require_possible, with_symbols
@@ -99,8 +99,7 @@ class Robot:
         NameUnknown
             If no link has this name.
         """
-        if name not in self._tree.places:
-            raise unknown(name, self.links, "link")
+        named(name, self.links, "link")
         body, placement = self._tree.places[name]
         position, rotation = self._position(body, placement), ca.SX(ca.DM(placement.rotation))
         if body is not None:
@@ -186,8 +185,7 @@ class Robot:
         names = self.q.force_names
         total = {name: ca.SX(0) for name in names}
         for name, value in mapping(forces, "The forces").items():
-            if name not in total:
-                raise unknown(name, names, "coordinate" if self.q.plain else "quasi-velocity")
+            named(name, names, "coordinate" if self.q.plain else "quasi-velocity")
             total[name] += column(value, f"the force on {name!r}", 1)[0]
         for name, value in zip(names, self._resistance(friction).elements(), strict=True):
             total[name] += value
@@ -271,8 +269,7 @@ class Robot:
         chosen = list(self._moving) if actuators is None else texts(actuators, "The actuators")
         places = dict(zip(self.q.names, self.q, strict=True))
         for name in chosen:
-            if name not in self._moving:
-                raise unknown(name, list(self._moving), "joint that can be driven")
+            named(name, list(self._moving), "joint that can be driven")
         return {actuator(name, self._moving[name]): places[name] for name in chosen}
 
 

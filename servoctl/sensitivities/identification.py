@@ -15,7 +15,7 @@ import numpy as np
 
 from servoctl.checks import named, numbers_by_name, require_kind, texts
 from servoctl.control.result import Closed
-from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.errors import IntegrationStopped, SpecificationError
 from servoctl.markup import Shown
 from servoctl.plants.equations import equations_at
 from servoctl.plants.plant import Plant
@@ -190,11 +190,9 @@ def _first_values(plant, parameters):
     """Names (k,) and first values (k,) of the parameters."""
     places = _places(plant)
     given = parameters if isinstance(parameters, Mapping) else {}
-    names = tuple(given) or texts(parameters, "The names of parameters")
     given = numbers_by_name(dict(given), places, "parameter", "first value")
-    for name in names:
-        if name not in places:
-            raise unknown(name, list(places), "parameter")
+    listed = tuple(given) or texts(parameters, "The names of parameters")
+    names = tuple(named(name, places, "parameter") for name in listed)
     if not names or len(set(names)) < len(names):
         raise SpecificationError(
             f"The parameters are {', '.join(names)}." if names else "No parameter is named.",

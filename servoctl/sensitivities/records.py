@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.checks import array_of, as_list, as_numbers, numbers_by_name
+from servoctl.checks import array_of, as_list, as_numbers, named, numbers_by_name
 from servoctl.control.conditions import steps
 from servoctl.control.result import Closed
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 from servoctl.values import frozen
 
 UNEVEN = 1e-3  # of the median interval: samples farther from equal intervals are uneven
@@ -200,8 +200,7 @@ def _checked(plant, data, noise):
     """Arrays (N,) by name, all of one length, at equal intervals, with finite values."""
     known = ("t", *plant.inputs, *plant.state_names, *plant.mechanism.outputs)
     for name in data:
-        if name not in known:
-            raise unknown(name, known, "measurement")
+        named(name, known, "measurement")
     missing = [name for name in ("t", *plant.inputs, *noise) if name not in data]
     if missing:
         raise SpecificationError(

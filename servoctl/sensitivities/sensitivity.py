@@ -197,8 +197,7 @@ def sensitivity(
             to=to,
         )
     for name in of:
-        if name not in known:
-            raise unknown(name, known, "signal")
+        named(name, known, "signal")
     initial = tuple(name for name in to if name not in model.numbers)
     for name in initial:
         if name not in model.state_names:

@@ -3,7 +3,8 @@
 import math
 
 import servoctl as sv
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.checks import named
+from servoctl.errors import ServoError, SpecificationError
 from servoctl.figures.style import write_png
 from servoctl.shell.options import MANY, assignment, by_name, deviation, limits, positive, used, whole
 
@@ -45,8 +46,7 @@ def require(args, model):
     }
     for option, (names, what) in valid.items():
         for name in by_name(getattr(args, option), f"--{option}"):
-            if name not in names:
-                raise unknown(name, names, what)
+            named(name, names, what)
 
 
 def _refuse(options, why):

@@ -1,7 +1,7 @@
 """The motion that a scene and options on the command line describe."""
 
-from servoctl.checks import as_span
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import as_span, named
+from servoctl.errors import SpecificationError
 from servoctl.shell.options import by_name
 from servoctl.shell.scenes import model_of
 from servoctl.values import frozen
@@ -37,10 +37,6 @@ def described(args, scene, report, require=lambda model: None):
 
 def with_parameters(model, changes):
     """The model with other values of parameters."""
-    valid = model.reduction.mechanism.parameters.names
-    for name in changes:
-        if name not in valid:
-            raise unknown(name, valid, "parameter")
     return model.with_parameters(**changes) if changes else model
 
 
@@ -57,6 +53,5 @@ def _start(model, scene, t0, hold, guess):
     outputs = model.reduction.mechanism.outputs
     known = (*model.state_names, *outputs)
     for name in held:
-        if name not in known:
-            raise unknown(name, known, "state or output" if outputs else "state")
+        named(name, known, "state or output" if outputs else "state")
     return model.start(t=t0, guess={**scene.guess, **guess}, **held)

@@ -6,8 +6,8 @@ from math import factorial
 
 import casadi as ca
 
-from servoctl.checks import as_list, column, is_whole, mapping, matrix, require_kind
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import as_list, column, is_whole, mapping, matrix, named, require_kind
+from servoctl.errors import SpecificationError
 from servoctl.jets.series import Motion, Series, is_zero
 from servoctl.jets.tape import Tape, divide, multiply
 from servoctl.units import units_by_name
@@ -17,10 +17,35 @@ _lock = threading.Lock()
 MOST_ORDER = 100  # of a derivative: k! of higher ones leaves the range of doubles soon
 
 
+class Column(ca.SX):
+    """A column of SX scalars that also unpacks, and indexes, as a tuple of them does."""
+
+    def __init__(self, items):
+        super().__init__(ca.vertcat(*items) if len(items) else ca.SX(0, 1))
+        self._items = tuple(items)
+
+    def __iter__(self):
+        return iter(self._items)
+
+    def __len__(self):
+        return len(self._items)
+
+    def __getitem__(self, place):
+        if isinstance(place, slice):
+            return Column(self._items[place])
+        return self._items[place] if is_whole(place) else super().__getitem__(place)
+
+    __setitem__ = None  # the symbols stay what they are
+
+    def __array_function__(self, func, types, args, kwargs):
+        return super().__array_function__(func, (ca.SX,), args, kwargs)  # CasADi knows its own types alone
+
+
 class Coordinates:
     """Generalised coordinates q, quasi-velocities w with q' = V w + h (3.1), and jets of any order.
 
-    Made by `coordinates`. Iterating gives the coordinates' symbols. Symbols of jets are made on first use.
+    Made by `coordinates`. Unpacks into the coordinates' symbols; CasADi's functions take it as their column. Symbols of
+    jets are made on first use.
 
     Attributes
     ----------
@@ -52,10 +77,18 @@ class Coordinates:
         return self.nq
 
     def __getitem__(self, name):
-        """The symbol of a coordinate by its name."""
-        if name not in self.names:
-            raise unknown(name, self.names, "coordinate")
-        return self._q[self.names.index(name)]
+        """The symbol of a coordinate by its name or its place, or a column of some by a slice."""
+        if isinstance(name, slice) or is_whole(name) and -self.nq <= name < self.nq:
+            return self.d(0)[name]
+        return self._q[self.names.index(named(name, self.names, "coordinate"))]
+
+    def __SX__(self):
+        return self.jet(0)  # by which CasADi's functions take it
+
+    @property
+    def T(self):
+        """The coordinates as a row, (1, nq) SX."""
+        return self.jet(0).T
 
     @property
     def n(self):
@@ -150,8 +183,8 @@ class Coordinates:
         return other
 
     def w(self, k=0):
-        """Symbols of the k-th derivative of the quasi-velocities, γ^(k+1): a tuple of n SX scalars."""
-        return self.gamma(_order(k) + 1)
+        """Symbols of the k-th derivative of the quasi-velocities, γ^(k+1): an SX column that unpacks into n scalars."""
+        return Column(self.gamma(_order(k) + 1))
 
     def gamma(self, k):
         """Symbols of γ^(k), k >= 1: a tuple of n SX scalars. γ' are the quasi-velocities."""
@@ -179,15 +212,13 @@ class Coordinates:
         return tuple(jet_name(name, k, self.plain) for name in self.force_names)
 
     def d(self, k=1):
-        """The k-th time derivatives of the coordinates: a tuple of nq SX scalars.
+        """The k-th time derivatives of the coordinates: an SX column that unpacks into nq scalars.
 
-        Symbols where q' = w, else expressions of w and its derivatives.
+        Symbols where q' = w, else expressions of w = `q.w()` and its derivatives.
         """
-        if _order(k) == 0:
-            return self._q
-        if self.plain:
-            return self.gamma(k)
-        return tuple(self.derivatives(self._q, k)[k])
+        if _order(k) == 0 or not self.plain:
+            return Column(self.derivatives(self._q, k)[k])
+        return Column(self.gamma(k))
 
     def dt(self, expression, k=1):
         """The k-th total time derivative of an expression of t, q and the jets.
@@ -313,7 +344,7 @@ class _SymbolicMotion(Motion):
 
     def coordinate(self, i, j):
         if j == 0:
-            return self.q.d(0)[i]
+            return self.q._q[i]
         if self.q.plain:
             return self.velocity(i, 0, j)
         rate = self.rates[i][j - 1]

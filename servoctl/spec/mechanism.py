@@ -7,13 +7,13 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, mapping, require_kind
+from servoctl.checks import column, distinct, mapping, named, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
 from servoctl.jets.branches import as_text, cse
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
-from servoctl.markup import Shown
+from servoctl.markup import Shown, listed
 from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
@@ -30,6 +30,8 @@ INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, rel
 
 class Mechanism(Shown):
     """A mechanism with forces, actuators and material constraints.
+
+    What bears the name of a coordinate, or of a signal before it, is read by a longer one: slew_input, m1_parameter.
 
     Main arguments
 
@@ -74,7 +76,7 @@ class Mechanism(Shown):
     SpecificationError
         If an expression names a symbol that is no coordinate, parameter or t; if S is not quadratic in γ''; if S
         and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric,
-        or not `mass`; if a coordinate has two units.
+        or not `mass`; if a coordinate has two units, or a name and its longer form are taken.
     NameUnknown
         If a force names no coordinate, or a unit nothing of the mechanism.
     """
@@ -113,7 +115,7 @@ class Mechanism(Shown):
         self.shapes = as_shapes(shapes, self._known)
         self.inputs, self.reported = (), {}
         self._refuse_orders()
-        self._refuse_names()
+        self._keep_names_apart()
         self.units = self._units(units)
         self._check_balance()
         if self._inverse_dynamics is not None:
@@ -130,6 +132,8 @@ class Mechanism(Shown):
         ):
             if names:
                 lines.append(f"  {what}: {', '.join(names)}")
+        if self.longer:
+            lines.append(f"  longer names, as other signals have the short ones: {listed(self.longer, 60)}")
         lines.append(f"  {self.parameters!r}"[:118])
         return "\n".join(lines)
 
@@ -254,8 +258,14 @@ class Mechanism(Shown):
             shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
-        driven.units = self.units
+        driven.units, driven.longer = self.units, self.longer
         return driven
+
+    @property
+    def signals(self):
+        """Names of what runs read, but for residuals and time derivatives; parameters are none."""
+        left_out = (name for kind in ("coordinate", "quasi-velocity") for name in self.left_out.get(kind, ()))
+        return ("t", "energy", *self.q.names, *self.q.velocity_names, *left_out, *self.actuators, *self.outputs)
 
     @cached_property
     def balance(self):
@@ -414,9 +424,8 @@ class Mechanism(Shown):
         """
         symbols = ca.symvar(ca.vertcat(*items)) if len(items) else []
         points = np.random.default_rng(IDENTITY_SEED).uniform(*RANDOM, (len(symbols), 4)).astype(np.longdouble)
-        for i, s in enumerate(symbols):
-            if self.q.where(s) is None:
-                points[i] *= self.parameters.defaults.get(s.name()) or 1.0  # what is zero by default may be set
+        for i, s in enumerate(symbols):  # what is zero by default may be set
+            points[i] *= self.parameters.defaults.get(self.parameters.name_of(s)) or 1.0
         return evaluate(Tape(symbols, items), points)
 
     def _known(self, value, what, size=1):
@@ -437,8 +446,7 @@ class Mechanism(Shown):
         names = self.q.force_names
         total = ca.SX.zeros(self.q.n)
         for name, value in forces.items():
-            if name not in names:
-                raise unknown(name, names, "coordinate" if self.q.plain else "quasi-velocity")
+            named(name, names, "coordinate" if self.q.plain else "quasi-velocity")
             total[names.index(name)] += self._known(value, f"the force on {name!r}")
         return total
 
@@ -521,23 +529,16 @@ class Mechanism(Shown):
                         limit=limit,
                     )
 
-    def _refuse_names(self):
-        taken = [*self.q.names, *(n for k in range(1, 4) for n in self.q.jet_names(k)), "t"]
-        seen = dict.fromkeys(taken, "a coordinate or derivative")
-        for what, names in (
-            ("a parameter", self.parameters.names),
-            ("an actuator", self.actuators),
-            ("an output", self.outputs),
-        ):
-            for name in names:
-                if name in seen:
-                    raise SpecificationError(
-                        f"{what.capitalize()} and {seen[name]} are both named {name!r}.",
-                        "Names in a result are unique.",
-                        do="Rename one of them.",
-                        name=name,
-                    )
-                seen[name] = what
+    def _keep_names_apart(self):
+        """Give longer names to actuators, outputs and parameters that bear the name of a signal before them."""
+        before = ("t", "energy", *self.q.names, *self.q.velocity_names)
+        actuators = distinct("actuator", self.actuators, before, self.actuators)
+        outputs = distinct("output", self.outputs, (*before, *actuators.values()), self.outputs)
+        self.actuators, self.outputs = tuple(actuators.values()), {outputs[n]: e for n, e in self.outputs.items()}
+        parameters = distinct("parameter", self.parameters.names, self.signals)
+        self.parameters = self.parameters.renamed(parameters)
+        read = [*actuators.items(), *outputs.items(), *parameters.items()]
+        self.longer = tuple(long for name, long in read if long != name)
 
 
 @lru_cache(32)
@@ -563,7 +564,7 @@ def _part(identity, places):
     part.constraints = {name: e for name, e in whole.constraints.items() if whole.places(e) <= places}
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
     part.shapes = {name: e for name, e in whole.shapes.items() if whole.places(e) <= places}
-    part.units = whole.units
+    part.units, part.longer = whole.units, whole.longer
     groups = {
         "coordinate": (q.names, part.q.names),
         "quasi-velocity": ((), ()) if q.plain else (q.velocity_names, part.q.velocity_names),

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite
+from servoctl.checks import by_name, finite
 from servoctl.errors import SpecificationError, unknown
 
 
@@ -15,9 +15,9 @@ class Parameters:
     defaults : dict of str to float
     """
 
-    def __init__(self, values):
+    def __init__(self, values, written=None):  # the symbols' own names, which `renamed` keeps
         self.defaults = dict(values)
-        self._symbols = {name: ca.SX.sym(name) for name in values}
+        self._symbols = dict(zip(values, map(ca.SX.sym, written or values), strict=True))
 
     def __getattr__(self, name):
         symbols = self.__dict__.get("_symbols", {})
@@ -28,7 +28,7 @@ class Parameters:
         raise unknown(name, list(symbols), "parameter")
 
     def __reduce__(self):
-        return Parameters, (self.defaults,)
+        return Parameters, (self.defaults, [symbol.name() for symbol in self.symbols])
 
     def __repr__(self):
         return "Parameters(" + ", ".join(f"{k}={v:g}" for k, v in self.defaults.items()) + ")"
@@ -42,6 +42,18 @@ class Parameters:
     def symbols(self):
         """The symbols, in the order of `names`."""
         return tuple(self._symbols.values())
+
+    def name_of(self, symbol):
+        """The name of a symbol, which may differ from the one that it prints; None if it is no parameter."""
+        return next((name for name, own in self._symbols.items() if own.element_hash() == symbol.element_hash()), None)
+
+    def renamed(self, names):
+        """These parameters, with the same symbols, by new names {old: new}; themselves where these are the same."""
+        if tuple(names.values()) == self.names:
+            return self
+        other = Parameters({names[name]: value for name, value in self.defaults.items()})
+        other._symbols = {names[name]: symbol for name, symbol in self._symbols.items()}
+        return other
 
     def extended(self, **values):
         """These parameters, with the same symbols, and further ones.
@@ -74,13 +86,7 @@ class Parameters:
             For a value that is no finite number.
         """
         numbers = dict(self.defaults)
-        if changes is not None and not isinstance(changes, dict):
-            raise SpecificationError(
-                f"The parameters are {changes!r}.", "Parameters change by name, in a dict.", values=changes
-            )
-        for name, value in (changes or {}).items():
-            if name not in numbers:
-                raise unknown(name, list(numbers), "parameter")
+        for name, value in by_name(changes, numbers, "parameter", "The parameters").items():
             numbers[name] = finite(name, value, "parameter")
         return np.array(list(numbers.values()), dtype=float)
 
@@ -103,7 +109,7 @@ def parameters(**values: float) -> Parameters:
         If a value is no finite number or a name would hide an attribute.
     """
     for name in values:
-        if name in ("t", "names", "values", "symbols", "defaults"):
+        if name in ("t", "defaults") or hasattr(Parameters, name):
             raise SpecificationError(
                 f"A parameter is named {name!r}.", "This name is reserved.", do="Rename it.", name=name
             )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from servoctl.checks import as_span, mapping, named, numbers_by_name, text
-from servoctl.errors import LimitExceeded, SpecificationError, unknown
+from servoctl.errors import LimitExceeded, SpecificationError
 from servoctl.markup import Shown
 from servoctl.progress import progress_bar
 from servoctl.study.cases import as_cases
@@ -337,8 +337,7 @@ def _checked_cases(cases, scene):
         if name in Levels.COLUMNS:
             rule = f"The table has a column of this name: {', '.join(Levels.COLUMNS)}."
             raise SpecificationError(f"A parameter is named {name!r}.", rule, do="Choose another name.", name=name)
-        if name not in known:
-            raise unknown(name, known, "parameter of a level")
+        named(name, known, "parameter of a level")
     return cases
 
 

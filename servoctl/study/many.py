@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_numbers, as_span, mapping, plain, require_kind, whole
+from servoctl.checks import as_numbers, as_span, mapping, meant, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
 from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
@@ -145,6 +145,7 @@ def _share_computed(part, span, method, times):
 def _case_table(model, starts, parameters):
     """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
     columns = {} if parameters is None or isinstance(parameters, dict) and not parameters else as_columns(parameters)
+    columns = {meant(name, model.numbers, "parameter") or name: column for name, column in columns.items()}
     lengths = {len(column) for column in columns.values()}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}

@@ -504,8 +504,7 @@ def _combinations(model, methods, drifts):
 def _ladders(settings, length):
     """Values of "rtol", and of "step" for a span of this length [s]."""
     for name in settings:
-        if name not in ("rtol", "step"):
-            raise unknown(name, ("rtol", "step"), "setting")
+        named(name, ("rtol", "step"), "setting")
     rtol = positives("rtol", settings.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
     step = positives("step", settings.get("step", [length / n for n in STEP_COUNTS]), "Leave step out.")
     return {"rtol": np.ravel(rtol).tolist(), "step": np.ravel(step).tolist()}

@@ -50,7 +50,8 @@ def verify_loop(closed):
 def _driven(closed):
     """Why dE/dt is not the power of the forces, where the energy depends on a disturbed parameter; "" elsewhere."""
     mechanism = closed.plant.mechanism
-    names = [s.name() for s in mechanism.parameters.symbols if depends_on(mechanism.energy, s)]
+    p = mechanism.parameters
+    names = [name for name, s in zip(p.names, p.symbols, strict=True) if depends_on(mechanism.energy, s)]
     disturbed = ", ".join(name for name in names if name in closed.conditions.disturbance)
     return f"the energy depends on {disturbed}, which is disturbed" if disturbed else ""
 
