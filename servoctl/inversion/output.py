@@ -288,7 +288,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     ends = [finite(parameter, end, "range") for end in interval(parameter, values, "range")]
     _require_program(model)
     _require_part(model, parameter)
-    at = model.start() if at is None else require_kind(State, "at", at, "model.start(...)")
+    at = model.default_start() if at is None else require_kind(State, "at", at, "model.start(...)")
     polynomial, grid = ZeroPolynomial(model, parameter, at), np.linspace(*ends, VALUES)
     _require_linearisation(model, at)
     polynomial.follow(grid)

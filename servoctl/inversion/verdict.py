@@ -142,7 +142,7 @@ def _of_motion(model, motion):
 def _lost_at_default_start(model, t):
     """As `_lost_rank`, of the start nearest to zero: a motion from elsewhere may have its rest there."""
     try:
-        return _lost_rank(model, t, np.asarray(model.start(t=t).values, dtype=float))
+        return _lost_rank(model, t, np.asarray(model.default_start(t).values, dtype=float))
     except ServoError:
         return ""
 
@@ -157,7 +157,7 @@ def _starting(model, motion):
     if isinstance(motion, Run):
         known = np.flatnonzero(np.isfinite(motion.jets[:n_x]).all(axis=0))[[0, -1]]
         return [(float(motion.t[k]), motion.jets[:n_x, k]) for k in known]
-    start = model.start() if motion is None else motion
+    start = model.default_start() if motion is None else motion
     return [(start.t, np.asarray(start.values, dtype=float))]
 
 

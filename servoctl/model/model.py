@@ -8,7 +8,7 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import MOST_JETS, as_numbers, by_name, finite, mapping, named, whole
+from servoctl.checks import MOST_JETS, as_numbers, by_name, finite, named, whole
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.errors import ServoError, SingularProgram, SpecificationError
 from servoctl.jets.series import Flow
@@ -705,10 +705,10 @@ class Model(Detailed):
         t : float
             Time of the start [s].
         guess : dict of str to float, optional
-            Approximate values; those passed to `derive` where there are none here. Where a path begins at rest, the
-            start is the state of rest nearest to them. Elsewhere free values start there if that is consistent; values
-            without a guess are as near to zero as the invariants allow. A coordinate that the model leaves out, and
-            that is named here or held, is a part of the state, and of the motions that begin there.
+            Approximate values. Where a path begins at rest, the start is the state of rest nearest to them. Elsewhere
+            free values start there if that is consistent; values without a guess are as near to zero as the invariants
+            allow. A coordinate that the model leaves out, and that is named here or held, is a part of the state, and
+            of the motions that begin there.
         hold : dict of str to SX, optional
             Further conditions by name: expressions of t, the coordinates and their derivatives of any order that are
             zero at the start, such as `{"heading": ca.atan2(dy, dx) - 0.5}`.
@@ -731,10 +731,12 @@ class Model(Detailed):
             If the machine stands still, its constraints leave a coordinate open there, and the motion has no limit.
         """
         model = self.including([*names_of(held), *names_of(guess)])
-        guess = mapping(guess, "The guesses")
-        derived_at = self._store.specification[2] or {}
-        guess = {name: value for name, value in derived_at.items() if name in model.state_names} | guess
         return started(model, finite("t", t, "time"), held, guess, hold)
+
+    def default_start(self, t=0.0):
+        """The start near the guess that `derive` received, without held values; errors as by `start`."""
+        guess = self._store.specification[2] or {}
+        return self.start(t, {name: value for name, value in guess.items() if name in self.state_names})
 
     def structure(self, motion=None, jets=None):
         """Index, relative degrees, zeros at infinity and essential orders (see `reduction.structure`).
@@ -743,7 +745,7 @@ class Model(Detailed):
         ----------
         motion : Run, State or (N,) array, optional
             A run, of which at most 50 samples are taken, a start, or times [s]. Default: seeded points of the manifold
-            and the start nearest to zero, where there is one.
+            and the start near the guess of `derive`, where there is one.
         jets : (n_z, N) array, optional
             At these times.
 
@@ -760,7 +762,7 @@ class Model(Detailed):
     def _default_start(self):
         """The time and the values of the start without held or guessed values; None if there is none."""
         try:
-            start = self.start()
+            start = self.default_start()
         except ServoError:
             return None
         return start.t, start.values
