@@ -167,9 +167,9 @@ class Aim:
     movable: np.ndarray
 
     @classmethod
-    def of(cls, names, guess, held):
-        """The state nearest to guessed values, with held ones."""
-        reference = np.array([held.get(name, guess.get(name, 0.0)) for name in names])
+    def of(cls, names, guess, held, identity):
+        """The state nearest to guessed values, with held ones; where neither says more, to zero or the identity's."""
+        reference = np.array([held.get(name, guess.get(name, identity.get(name, 0.0))) for name in names])
         weights = np.array([GUESSED if name in guess and name not in held else 1.0 for name in names])
         return cls(names, reference, weights, np.array([name not in held for name in names]))
 
@@ -182,8 +182,8 @@ def consistent(model, t, held, guess, hold):
     guess = {name: _known(model, name, value, states) for name, value in mapping(guess, "The guesses").items()}
     chosen = guess | values
     names = JetEquations(model, t, conditions).names
-    aim = Aim.of(names, guess, values)
-    equations, x, residual = _solve(model, t, aim, conditions)
+    aim = Aim.of(names, guess, values, model.reduction.mechanism.q.identity)
+    equations, x, residual = _solve(model, t, aim, model.reduction.mechanism.followers | conditions)
     if not residual < TOLERANCE:
         _refuse(equations, aim, dict.fromkeys(conditions, 0.0) | held, x)
     free = free_names(equations, x, aim, chosen)
@@ -405,14 +405,12 @@ def _clear_choice(x, y, aim, model):
 
 
 def _same_motion(x, y, model):
-    """Whether states differ by whole turns of coordinates only, or by the sign of a quaternion."""
-    nq, small = model.nq, DISTINCT * (1.0 + np.abs(y))
-    if np.any(np.abs(x - y)[nq:] > small[nq:]):
-        return False
-    turned = x[:nq] - y[:nq]
-    turned -= 2 * np.pi * np.round(turned / (2 * np.pi))
-    opposite = bool(model.reduction.mechanism.q.invariants) and np.all(np.abs(x + y)[:nq] <= small[:nq])
-    return opposite or bool(np.all(np.abs(turned) <= small[:nq]))
+    """Whether states differ by whole turns of coordinates only, or by the signs of quaternions."""
+    nq, small, x = model.nq, DISTINCT * (1.0 + np.abs(y)), x.copy()
+    for e in (list(places) for places, _ in model.reduction.mechanism.q.spheres):
+        x[e] = np.copysign(1.0, x[e] @ y[e]) * x[e]
+    x[:nq] -= 2 * np.pi * np.round((x - y)[:nq] / (2 * np.pi))
+    return bool(np.all(np.abs(x - y) <= small))
 
 
 def _refuse(equations, aim, held, x):

@@ -8,12 +8,13 @@ from servoctl.errors import SpecificationError
 from servoctl.robots.joints import identifier, some_posture, unit_quaternions
 from servoctl.robots.robot import Frame, Robot
 from servoctl.spec import rotations
+from servoctl.spec.mechanism import Constraints
 
 HOLDS = ("position", "pose")
 POSTURE_SEED = 20033  # of the postures at which rows are compared
 POSTURES = 3
 ALONE = 1e-6  # [rad, m] largest difference of postures that are one: nothing moves
-FOLLOWS = 1e-9  # part of the largest singular value below which rows of Jacobians depend on others
+FOLLOWS = 1e-5  # part of the largest singular value below which rows of Jacobians depend on others: files with 5 digits
 
 
 def held(robot: Robot, frames, at) -> dict:
@@ -34,7 +35,7 @@ def held(robot: Robot, frames, at) -> dict:
     dict of str to SX
         Rows foot_x, foot_y, foot_z [m] and foot_rx, foot_ry, foot_rz: the vector 2 tan(angle/2) along the axis of the
         rotation from the held orientation [rad], which goes to infinity, not back to zero, at half a turn. Rows that
-        follow from the others wherever all hold are left out.
+        follow from the others wherever all hold are left out; starts satisfy them, too. Rows join by |.
 
     Raises
     ------
@@ -90,7 +91,7 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
             frames=[a.name, b.name],
         )
     rows = _coinciding(identifier(name), a.rotation.T @ (b.position - a.position), a.rotation.T @ b.rotation, kind)
-    return _without_followers(rows, a.q, None, None)
+    return _without_followers(rows, a.q, None, None, kind == "position")
 
 
 def _coinciding(name, offset, rotation, kind):
@@ -101,7 +102,7 @@ def _coinciding(name, offset, rotation, kind):
     return rows
 
 
-def _without_followers(rows, q, parameters, at):
+def _without_followers(rows, q, parameters, at, alone=False):
     """The rows without those that depend on rows before them wherever all of them vanish.
 
     Parameters
@@ -111,6 +112,8 @@ def _without_followers(rows, q, parameters, at):
     parameters : Parameters or None
     at : (nq,) array or None
         A posture in which all rows vanish, where one is known.
+    alone : bool
+        Whether the rows are those of positions alone.
     """
     symbols = ca.vertcat(*q, *((parameters.symbols) if parameters else ()))
     values = ca.vertcat(*rows.values())
@@ -125,7 +128,7 @@ def _without_followers(rows, q, parameters, at):
     if not closed or max(np.abs(place - closed[0]).max() for place in closed) < ALONE:
         kept = _adding([np.array(evaluate(place)[1]) for place in places], kept)
     if len(kept) < len(rows) and not closed and at is None:
-        _refuse_contradiction(list(rows), kept, evaluate, places, q)
+        _refuse_contradiction(list(rows), kept, evaluate, places, q, alone)
     if rows and not kept:
         raise SpecificationError(
             f"The rows {', '.join(rows)} have the same values in every posture."[:300],
@@ -133,7 +136,9 @@ def _without_followers(rows, q, parameters, at):
             do="Name links beyond a joint that moves.",
             rows=list(rows),
         )
-    return {name: row for i, (name, row) in enumerate(rows.items()) if i in kept}
+    names = [list(rows)[i] for i in kept]
+    followers = {name: ca.fmax(ca.fabs(row) - FOLLOWS, 0) for name, row in rows.items() if name not in names}
+    return Constraints({name: rows[name] for name in names}, followers)
 
 
 def _near(q, at, place):
@@ -156,7 +161,7 @@ def _full_rank(matrix):
     return len(singular) == len(matrix) and singular[-1] > FOLLOWS * max(1.0, singular[0])
 
 
-def _refuse_contradiction(names, kept, evaluate, places, q):
+def _refuse_contradiction(names, kept, evaluate, places, q, alone):
     """Refuse rows left out that do not vanish where the others do."""
     dropped = [i for i in range(len(names)) if i not in kept]
     for place in places:
@@ -169,7 +174,7 @@ def _refuse_contradiction(names, kept, evaluate, places, q):
             raise SpecificationError(
                 f"The chain cannot be closed: {names[worst]!r} is {values[worst]:.3g} where the other rows vanish.",
                 "The frames coincide in some posture.",
-                do='Correct the frames, or close their position alone, kind="position".',
+                do="Correct the frames" + (", or cut the chain elsewhere." if alone else ', or pass kind="position".'),
                 row=names[worst],
                 value=float(values[worst]),
             )
@@ -182,7 +187,7 @@ def _newton(evaluate, kept, place, q):
         values, jacobian, frame = (np.array(part) for part in evaluate(place))
         if not np.isfinite(jacobian).all():
             return None
-        if np.abs(values[kept]).max(initial=0.0) < 1e-2 * FOLLOWS:
+        if np.abs(values[kept]).max(initial=0.0) < FOLLOWS**2:
             return place
         step = np.linalg.lstsq(jacobian[kept], -values[kept].ravel(), rcond=None)[0]
         place[: q.nq] += frame @ (step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))

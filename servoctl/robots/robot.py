@@ -11,7 +11,7 @@ from servoctl.errors import SpecificationError, unknown
 from servoctl.robots.description import described
 from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
 from servoctl.robots.inertia import require_possible, with_symbols
-from servoctl.robots.joints import actuator, axes_of, scalars
+from servoctl.robots.joints import actuator, axes_of
 from servoctl.robots.tree import ONE_AXIS, tree, with_followers
 from servoctl.spec.mechanism import Mechanism
 from servoctl.values import frozen
@@ -122,13 +122,12 @@ class Robot:
         NameUnknown
             If one is no coordinate.
         """
-        numbers = {name: 1.0 if name in scalars(self.q) else 0.0 for name in self.q.names}
+        numbers = {name: self.q.identity.get(name, 0.0) for name in self.q.names}
         for name, value in mapping(at, "The posture").items():
             numbers[named(name, self.q.names, "coordinate")] = finite(name, value, "coordinate")
         posture = np.array(list(numbers.values()))
-        for name in scalars(self.q):
-            end = self.q.names.index(name) + 1
-            posture[end - 4 : end] = _unit(self.q.names[end - 4 : end], posture[end - 4 : end])
+        for e in (list(places) for places, _ in self.q.spheres):
+            posture[e] = _unit([self.q.names[i] for i in e], posture[e])
         return posture
 
     def at(self, posture, link):

@@ -28,6 +28,23 @@ RANDOM = (0.3, 1.3)  # range of these, with parameters in units of their default
 INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, relative to the largest bracket
 
 
+class Constraints(dict):
+    """Rows by name, and `followers` by name: rows left out that hold on one branch of these, where a start is sought.
+
+    They join with others by |.
+    """
+
+    def __init__(self, rows, followers):
+        super().__init__(rows)
+        self.followers = followers
+
+    def __or__(self, other):
+        return Constraints({**self, **other}, self.followers | getattr(other, "followers", {}))
+
+    def __ror__(self, other):
+        return Constraints({**other, **self}, self.followers)
+
+
 class Mechanism(Shown):
     """A mechanism with forces, actuators and material constraints.
 
@@ -109,6 +126,7 @@ class Mechanism(Shown):
         self.actuators = tuple(mapping(actuators, "The actuators"))
         self.E = self._directions(actuators or {})
         self.constraints = self._named(constraints, "constraint")
+        self.followers = self._named(getattr(constraints, "followers", None), "constraint")
         self.outputs = self._named(outputs, "output")
         self.shapes = as_shapes(shapes, self._known)
         self.inputs, self.reported = (), {}
@@ -139,7 +157,7 @@ class Mechanism(Shown):
         names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
         expressions = [
             q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
-            *self.constraints.values(), *self.outputs.values(), *self.shapes.values(),
+            *self.constraints.values(), *self.followers.values(), *self.outputs.values(), *self.shapes.values(),
         ]  # fmt: skip
         function = as_text(q.as_function([*expressions, *self.reported.values()], p.symbols))
         facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
@@ -254,7 +272,7 @@ class Mechanism(Shown):
             shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
-        driven.units = self.units
+        driven.units, driven.followers = self.units, self.followers
         return driven
 
     @cached_property
@@ -423,7 +441,7 @@ class Mechanism(Shown):
         """An SX scalar or column in symbols of the mechanism."""
         expression = ca.vertcat(*settled(column(value, what, size)))
         require_known(expression, self, what)
-        return expression
+        return self.q.on_spheres(expression)
 
     def _named(self, values, what):
         named = mapping(values, f"The {what}s").items()
@@ -560,7 +578,10 @@ def _part(identity, places):
     )
     part._mass = None if whole._mass is None else whole._mass[velocities, velocities]
     part.actuators, part.E = tuple(whole.actuators[j] for j in columns), whole.E[velocities, columns]
-    part.constraints = {name: e for name, e in whole.constraints.items() if whole.places(e) <= places}
+    part.constraints, part.followers = (
+        {name: e for name, e in rows.items() if whole.places(e) <= places}
+        for rows in (whole.constraints, whole.followers)
+    )
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
     part.shapes = {name: e for name, e in whole.shapes.items() if whole.places(e) <= places}
     part.units = whole.units
