@@ -91,7 +91,7 @@ def loop(a: Frame, b: Frame, kind="pose", name="loop") -> dict:
             frames=[a.name, b.name],
         )
     rows = _coinciding(identifier(name), a.rotation.T @ (b.position - a.position), a.rotation.T @ b.rotation, kind)
-    return _without_followers(rows, a.q, None, None, kind == "position")
+    return _without_followers(rows, a.q, None, None)
 
 
 def _coinciding(name, offset, rotation, kind):
@@ -102,7 +102,7 @@ def _coinciding(name, offset, rotation, kind):
     return rows
 
 
-def _without_followers(rows, q, parameters, at, alone=False):
+def _without_followers(rows, q, parameters, at):
     """The rows without those that depend on rows before them wherever all of them vanish.
 
     Parameters
@@ -112,8 +112,6 @@ def _without_followers(rows, q, parameters, at, alone=False):
     parameters : Parameters or None
     at : (nq,) array or None
         A posture in which all rows vanish, where one is known.
-    alone : bool
-        Whether the rows are those of positions alone.
     """
     symbols = ca.vertcat(*q, *((parameters.symbols) if parameters else ()))
     values = ca.vertcat(*rows.values())
@@ -128,7 +126,7 @@ def _without_followers(rows, q, parameters, at, alone=False):
     if not closed or max(np.abs(place - closed[0]).max() for place in closed) < ALONE:
         kept = _adding([np.array(evaluate(place)[1]) for place in places], kept)
     if len(kept) < len(rows) and not closed and at is None:
-        _refuse_contradiction(list(rows), kept, evaluate, places, q, alone)
+        _refuse_contradiction(list(rows), kept, evaluate, places, q)
     if rows and not kept:
         raise SpecificationError(
             f"The rows {', '.join(rows)} have the same values in every posture."[:300],
@@ -161,7 +159,7 @@ def _full_rank(matrix):
     return len(singular) == len(matrix) and singular[-1] > FOLLOWS * max(1.0, singular[0])
 
 
-def _refuse_contradiction(names, kept, evaluate, places, q, alone):
+def _refuse_contradiction(names, kept, evaluate, places, q):
     """Refuse rows left out that do not vanish where the others do."""
     dropped = [i for i in range(len(names)) if i not in kept]
     for place in places:
@@ -174,7 +172,7 @@ def _refuse_contradiction(names, kept, evaluate, places, q, alone):
             raise SpecificationError(
                 f"The chain cannot be closed: {names[worst]!r} is {values[worst]:.3g} where the other rows vanish.",
                 "The frames coincide in some posture.",
-                do="Correct the frames" + (", or cut the chain elsewhere." if alone else ', or pass kind="position".'),
+                do="Correct the frames, or cut the chain elsewhere.",
                 row=names[worst],
                 value=float(values[worst]),
             )

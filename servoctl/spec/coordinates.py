@@ -136,17 +136,7 @@ class Coordinates:
         return tuple(self.where(s)[2] for s in e.elements()), -least / norm
 
     def on_spheres(self, expression):
-        """An expression that is the same along the rays of quaternions, as it is where these have their length.
-
-        Parameters
-        ----------
-        expression : SX
-
-        Returns
-        -------
-        SX
-            What is combined with others or differentiated means the same off the invariants, such as 1 - 2(y² + z²).
-        """
+        """An expression that has its values at unit quaternions for those of any length, also as 1 - 2(y² + z²)."""
         for places, square in self.spheres:
             e = ca.vertcat(*(self._q[i] for i in places))
             if not vanish(spread(ca.jtimes(expression, e, e).elements())).all():
