@@ -181,13 +181,11 @@ def _refuse_contradiction(names, kept, evaluate, places, q):
 
 def _newton(evaluate, kept, place, q):
     """A posture in which the rows kept vanish, by Newton's iteration from a posture; None where it finds none."""
-    for _ in range(50):
+    for _ in range(50):  # all of them: at a stretched arm each halves what is left
         values, jacobian, frame = (np.array(part) for part in evaluate(place))
         if not np.isfinite(jacobian).all():
             return None
-        if np.abs(values[kept]).max(initial=0.0) < FOLLOWS**2:
-            return place
         step = np.linalg.lstsq(jacobian[kept], -values[kept].ravel(), rcond=None)[0]
         place[: q.nq] += frame @ (step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))
         place[: q.nq] = unit_quaternions(q, place[: q.nq])
-    return None
+    return place if np.abs(values[kept]).max(initial=0.0) < 1e-6 * FOLLOWS else None

@@ -246,7 +246,7 @@ class Robot:
         """Coefficients of a kind by coordinate."""
         return {name: getattr(j, key) for name, j in self._moving.items() if getattr(j, key)}
 
-    def _resistance(self, friction, armature):
+    def _resistance(self, friction, armature=None):
         """Generalised forces of damping, friction and the inertia of rotors, (n,) SX."""
         if friction is None and self.friction:
             named = ", ".join(self.friction)
