@@ -182,7 +182,16 @@ def consistent(model, t, held, guess, hold):
     guess = {name: _known(model, name, value, states) for name, value in mapping(guess, "The guesses").items()}
     chosen = guess | values
     names = JetEquations(model, t, conditions).names
-    aim = Aim.of(names, guess, values, model.reduction.mechanism.q.identity)
+    q = model.reduction.mechanism.q
+    aim = Aim.of(names, guess, values, q.identity)
+    for e in (list(places) for places, _ in q.spheres):
+        if not aim.reference[e].any() and {*chosen} & {q.names[i] for i in e}:
+            raise SpecificationError(
+                f"The values of {', '.join(q.names[i] for i in e)} are zero, a quaternion of length 0.",
+                "A quaternion has a direction.",
+                f"{next((q.names[i] for i in e if q.names[i] in q.identity), q.names[e[0]])} = 1.",
+                do="Guess another value, or leave all of them out.",
+            )
     equations, x, residual = _solve(model, t, aim, model.reduction.mechanism.followers | conditions)
     if not residual < TOLERANCE:
         _refuse(equations, aim, dict.fromkeys(conditions, 0.0) | held, x)
