@@ -301,9 +301,8 @@ class Mechanism(Shown):
     def energy(self):
         """Kinetic plus potential energy [J], SX; without a kinetic energy T it is taken as wᵀMw/2."""
         w, acceleration = (ca.vertcat(*self.q.gamma(k)) for k in (1, 2))
-        if self._kinetic is None:
-            return ca.dot(w, self.mass @ w) / 2 + self.potential
-        return self._kinetic + ca.dot(w, ca.substitute(self._added, acceleration, w)) / 2 + self.potential
+        inertia = self.mass if self._kinetic is None else ca.jacobian(self._added, acceleration)
+        return ca.dot(w, inertia @ w) / 2 + (0 if self._kinetic is None else self._kinetic) + self.potential
 
     def _check_balance(self):
         given = {"gibbs": self._gibbs, "kinetic": self._kinetic, "balance": self._inverse_dynamics, "mass": self._mass}
