@@ -219,12 +219,12 @@ def curvature(name, q, position, value):
     Returns
     -------
     dict of str to SX
-        One residual [m^2/s^3]: x' y'' - y' x'' - curvature |v|^3.
+        One residual [1/m], without a value at rest: (x' y'' - y' x'')/|v|^3 - curvature.
     """
     v, a = (_rate_of(name, q, position, k) for k in (1, 2))
     _require_plane(name, v)
     (value,) = column(value, f"the curvature of {name!r}", 1)
-    return {name: v[0] * a[1] - v[1] * a[0] - value * ca.dot(v, v) ** 1.5}
+    return {name: (v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5 - value}
 
 
 def curvature_rate(name, q, position, value):
@@ -263,11 +263,11 @@ def perpendicular_velocities(name, q, a, b):
     Returns
     -------
     dict of str to SX
-        One residual [m^2/s^2].
+        One residual, the cosine of the angle between them, without a value where one rests.
     """
     first, second = _rate_of(name, q, a, 1), _rate_of(name, q, b, 1)
     _require_equal(name, first, second)
-    return {name: ca.dot(first, second)}
+    return {name: ca.dot(first, second) / ca.sqrt(ca.sumsqr(first) * ca.sumsqr(second))}
 
 
 def energy(name, mechanism, value):

@@ -81,6 +81,32 @@ def function_of(robot, *expressions):
     return lambda *state: [np.array(value).squeeze() for value in f.call([ca.DM(part) for part in state])]
 
 
+def bodies(*links, axes=(), mass=1.0, centre="0 0 0", moments=(0.01, 0.01, 0.01), points=None, more="", inside=""):
+    """The text of a chain of bodies on revolute joints ja, jb, ..., with massless points fixed to the first one.
+
+    Mass, centre and moments are those of the last body, others have 5 kg; `inside` is text of each joint.
+    """
+    parts = []
+    for i, name in enumerate(links):
+        last = i == len(links) - 1
+        ixx, iyy, izz = moments if last else (0.05, 0.05, 0.05)
+        parts.append(
+            f'<link name="{name}"><inertial><origin xyz="{centre if last else "0 0 0"}"/><mass value="{mass if last else 5}"/>'
+            f'<inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial></link>'
+        )
+    for i, axis in enumerate(axes):
+        parts.append(
+            f'<joint name="j{"abc"[i]}" type="continuous"><parent link="{links[i]}"/><child link="{links[i + 1]}"/>'
+            f'<axis xyz="{axis}"/>{inside}</joint>'
+        )
+    for name, place in (points or {}).items():
+        parts.append(
+            f'<link name="{name}"/><joint name="to_{name}" type="fixed"><parent link="{links[0]}"/><child link="{name}"/>'
+            f'<origin xyz="{place}"/></joint>'
+        )
+    return f'<robot name="bodies">{"".join(parts)}{more}</robot>'
+
+
 def two_legs():
     """The text of a trunk on two legs of hip, knee and ankle, whose axes are parallel; soles are welded to feet."""
     body = (

@@ -223,9 +223,9 @@ def test_programs_are_the_residuals_that_they_say():
         "speed": (programs.constant_speed("p", q, point, 2.0)["p"], (dx**2 + dy**2 - 4) / 4),
         "acceleration": (programs.acceleration_norm("p", q, point, 2.0)["p"], (d2x**2 + d2y**2 - 4) / 4),
         "jerk": (programs.jerk_norm("p", q, point, 2.0)["p"], (d3x**2 + d3y**2 - 4) / 4),
-        "curvature": (programs.curvature("p", q, point, 0.3)["p"], (curvature - 0.3) * speed**3),
+        "curvature": (programs.curvature("p", q, point, 0.3)["p"], curvature - 0.3),
         "rate": (programs.curvature_rate("p", q, point, 0.3)["p"], q.dt(curvature) - 0.3),
-        "perpendicular": (programs.perpendicular_velocities("p", q, point, (y, x))["p"], 2 * dx * dy),
+        "perpendicular": (programs.perpendicular_velocities("p", q, point, (y, x))["p"], 2 * dx * dy / speed**2),
         "formation": (programs.formation("p", point, {"b": (y, x)}, {"b": (1.0, 2.0)})["p_b_x"], y - x - 1.0),
     }
     for name, (ours, wanted) in by_hand.items():

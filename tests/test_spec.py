@@ -107,8 +107,8 @@ def test_a_quaternion_takes_both_a_gibbs_function_and_a_kinetic_energy():
 
 
 def test_inertia_may_be_a_diagonal_a_list_or_an_array():
-    q = sv.coordinates("a b c")
-    rates = q.d(1)
+    q, _ = quaternion()
+    rates = q.w()
     full = sv.rigid_body(q, 0, ca.diag(ca.SX([1.0, 2.0, 3.0])), rates=rates)
     for inertia in ((1.0, 2.0, 3.0), [1.0, 2.0, 3.0], ca.SX([1, 2, 3]), np.diag([1.0, 2, 3]), np.array([1.0, 2, 3]),
                     [[1, 0, 0], [0, 2, 0], [0, 0, 3]], ca.DM([1, 2, 3])):  # fmt: skip

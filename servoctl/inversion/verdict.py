@@ -237,21 +237,22 @@ def _reach(end, length):
 def _constants(model, rest):
     """Constraints on velocities at a rest whose constants are eigenvalues 0, by name.
 
-    Where a(q)·γ' = b is linearised at a rest, a·δq is constant: an eigenvalue 0 for each independent row a.
+    Where a(q)·γ' = b is linearised at a rest, a·V⁺δq is constant: an eigenvalue 0 for each independent row a.
     """
     r, q = model.reduction, model.reduction.mechanism.q
     rows = {**r.mechanism.constraints, **r.program.residuals}
     rows = {name: e for name, e in rows.items() if q.order(e) == 1}
-    if not (rows and rest and q.plain):
+    if not (rows and rest):
         return ()
     end = next(iter(rest.values()))
     slopes = ca.jacobian(ca.vertcat(*rows.values()), ca.vertcat(*q.gamma(1)))
     state = ca.vertcat(*q, *q.gamma(1))
     p = ca.vertcat(*r.mechanism.parameters.symbols)
-    f = ca.Function("slopes", [q.t, state, p], [ca.densify(slopes)])
-    a = np.array(f(end.t, end.x[: 2 * q.n], model.parameters))
+    f = ca.Function("slopes", [q.t, state, p], [ca.densify(slopes), ca.densify(q.V)])
+    slopes, V = map(np.array, f(end.t, end.x[: q.nq + q.n], model.parameters))
+    a = slopes @ np.linalg.pinv(V)
     entries = FreeEntries(model, end.t, end.x)
-    tangent = entries.local(np.array([end.t]), end.x[:, None])[3][0][: q.n]
+    tangent = entries.local(np.array([end.t]), end.x[:, None])[3][0][: q.nq]
     zero = np.abs(end.eigenvalues) <= AT_ZERO * np.abs(end.eigenvalues).max(initial=1.0)
     rank = np.linalg.matrix_rank(a @ tangent, AT_ZERO * max(1.0, np.abs(a).max()))
     return tuple(rows) if rank and rank == zero.sum() else ()

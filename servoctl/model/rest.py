@@ -187,7 +187,8 @@ def _at_rest(model, t, chosen):
     """The constraints as they were written, and the state nearest the chosen values that satisfies them."""
     rows = tuple(row for row in model.reduction.original.values() if row.order <= model.reduction.top)
     equations = JetEquations(model, t, {}, rows)
-    aim = Aim.of(equations.names, {name: v for name, v in chosen.items() if name in equations.names}, {})
+    known = {name: v for name, v in chosen.items() if name in equations.names}
+    aim = Aim.of(equations.names, known, {}, model.reduction.mechanism.q.identity)
     return rows, equations, aim, gauss_newton(equations, aim.reference, aim)
 
 

@@ -28,8 +28,10 @@ class Rests:
     """
 
     def __init__(self, mechanism, balance, B, rows):
-        q, rows = mechanism.q, {name: e for name, e in rows.items() if mechanism.q.order(e) <= 0}
+        q = mechanism.q
+        rows = {name: e for name, e in (rows | mechanism.followers).items() if q.order(e) <= 0}
         self.coordinates, self.nq, self.n = q.names, q.nq, q.n
+        self.zero = {name: 0.0 for name in q.names} | q.identity
         self.names = (*(f"balance of {name}" for name in q.force_names), *rows)
         mu, p, self.angles = ca.SX.sym("mu", B.shape[1]), ca.vertcat(*mechanism.parameters.symbols), None
         z = ca.vertcat(q.jet(0), mu)
@@ -100,7 +102,7 @@ class Rests:
 
         `guess` has values of coordinates by name, `fixed` are the names of those that stay.
         """
-        first = np.array([guess.get(name, 0.0) for name in self.coordinates], dtype=float)
+        first = np.array([guess.get(name, zero) for name, zero in self.zero.items()], dtype=float)
         known, movable = np.isin(self.coordinates, list(guess)), ~np.isin(self.coordinates, list(fixed))
         self.angles = self._angles(t, p, first)
         found, reason, sizes = [], None, None

@@ -174,9 +174,9 @@ class Aim:
     movable: np.ndarray
 
     @classmethod
-    def of(cls, names, guess, held):
-        """The state nearest to guessed values, with held ones."""
-        reference = np.array([held.get(name, guess.get(name, 0.0)) for name in names])
+    def of(cls, names, guess, held, identity):
+        """The state nearest to guessed values, with held ones; where neither says more, to zero or the identity's."""
+        reference = np.array([held.get(name, guess.get(name, identity.get(name, 0.0))) for name in names])
         weights = np.array([GUESSED if name in guess and name not in held else 1.0 for name in names])
         return cls(names, reference, weights, np.array([name not in held for name in names]))
 
@@ -189,11 +189,22 @@ def consistent(model, t, held, guess, hold):
     guess = {name: _known(model, name, value, states) for name, value in mapping(guess, "The guesses").items()}
     chosen = guess | values
     names = JetEquations(model, t, conditions).names
-    aim = Aim.of(names, guess, values)
-    equations, branches = _rests(model, t, aim, values, conditions) or _solved(model, t, aim, conditions, held)
-    x, fixed = branches[0], tuple(dict.fromkeys((*held, *conditions)))
+    q = model.reduction.mechanism.q
+    aim = Aim.of(names, guess, values, q.identity)
+    for e in (list(places) for places, _ in q.spheres):
+        if not aim.reference[e].any() and {*chosen} & {q.names[i] for i in e}:
+            raise SpecificationError(
+                f"The values of {', '.join(q.names[i] for i in e)} are zero, a quaternion of length 0.",
+                "A quaternion has a direction.",
+                f"{next((q.names[i] for i in e if q.names[i] in q.identity), q.names[e[0]])} = 1.",
+                do="Guess another value, or leave all of them out.",
+            )
+    rows, fixed = model.reduction.mechanism.followers | conditions, dict.fromkeys(conditions, 0.0) | held
+    equations, branches = _rests(model, t, aim, values, rows) or _solved(model, t, aim, rows, fixed)
+    x = branches[0]
     left = tuple(name for name in free_names(equations, x, aim, chosen) if name in states)
-    return State(t, x[:n_x], states, fixed, left, _largest(equations, x), branches=branches[:, :n_x])
+    fixed, residual = tuple(dict.fromkeys((*held, *conditions))), _largest(equations, x)
+    return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x])
 
 
 def _rests(model, t, aim, held, conditions):
@@ -293,7 +304,7 @@ def _solved(model, t, aim, conditions, held):
     """The equations, and the state nearest to the guess before others that the guess excludes no better."""
     equations, x, residual = _solve(model, t, aim, conditions)
     if not residual < TOLERANCE:
-        _refuse(equations, aim, conditions, dict.fromkeys(conditions, 0.0) | held, x)
+        _refuse(equations, aim, held, x)
     guessed = aim.weights > 1.0
     chosen = np.where(guessed | ~aim.movable)[0]
     free = free_names(equations, x, aim, {aim.names[i] for i in chosen})
@@ -459,20 +470,19 @@ def _clear_choice(x, y, aim, model):
 
 
 def _same_motion(x, y, model):
-    """Whether states differ by whole turns of coordinates only, or by the sign of a quaternion."""
-    nq, small = model.nq, DISTINCT * (1.0 + np.abs(y))
-    if np.any(np.abs(x - y)[nq:] > small[nq:]):
-        return False
-    turned = x[:nq] - y[:nq]
-    turned -= 2 * np.pi * np.round(turned / (2 * np.pi))
-    opposite = bool(model.reduction.mechanism.q.invariants) and np.all(np.abs(x + y)[:nq] <= small[:nq])
-    return opposite or bool(np.all(np.abs(turned) <= small[:nq]))
+    """Whether states differ by whole turns of coordinates only, or by the signs of quaternions."""
+    nq, small, x = model.nq, DISTINCT * (1.0 + np.abs(y)), x.copy()
+    for e in (list(places) for places, _ in model.reduction.mechanism.q.spheres):
+        x[e] = np.copysign(1.0, x[e] @ y[e]) * x[e]
+    x[:nq] -= 2 * np.pi * np.round((x - y)[:nq] / (2 * np.pi))
+    return bool(np.all(np.abs(x - y) <= small))
 
 
-def _refuse(equations, aim, conditions, held, x):
+def _refuse(equations, aim, held, x):
     """Raise InconsistentStart: a held value contradicts an equation, or no state satisfies one."""
     residuals = np.abs(equations.scaled(x))
-    alone, all_movable = equations.without(conditions), replace(aim, movable=np.ones(len(aim.names), dtype=bool))
+    alone = equations.without([name for name in held if name not in aim.names])
+    all_movable = replace(aim, movable=np.ones(len(aim.names), dtype=bool))
     if held and _loosened(alone, all_movable, x)[1] < TOLERANCE:
         change, nearest = _nearest_held(equations, aim, held, x)
         largest, worst = max(zip(residuals, equations.rows, strict=True))

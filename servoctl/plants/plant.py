@@ -84,8 +84,8 @@ def plant(
     numbers = np.concatenate([values, [damping[names[i]] for i in damped], rates])
     state_names = (*mechanism.q.names, *mechanism.q.jet_names(1), *(actuators[i] for i in lagged))
     return Plant(
-        mechanism, numbers, state_names, actuators, tuple(names),
-        _limits(limits, actuators), rate_limits, lag, {n: d for n, d in delay.items() if d}, damping, equations,
+        mechanism, numbers, state_names, actuators, tuple(names), _limits(limits, actuators, mechanism.passive),
+        rate_limits, lag, {n: d for n, d in delay.items() if d}, damping, equations,
     )  # fmt: skip
 
 
@@ -396,7 +396,8 @@ def _text(values):
     return ", ".join(f"{name} {value:g}" for name, value in values.items())
 
 
-def _limits(limits, actuators):
+def _limits(limits, actuators, passive):
+    limits = {name: value for name, value in mapping(limits, "The limits").items() if name not in passive}
     limits = by_name(limits, actuators, "actuator", "The limits")
     return {name: interval(name, value, "limit") for name, value in limits.items()}
 

@@ -367,7 +367,7 @@ def anywhere(q, level, context):
 def _random_starts(q, level, context):
     """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, about zero where there is none."""
     rng, nz = np.random.default_rng(POINTS_SEED), q.nq + level * q.n
-    centre = np.zeros(nz)
+    centre = np.array([q.identity.get(name, 0.0) for name in q.names] + [0.0] * level * q.n)
     usual = np.ones(nz) if context.scales is None else context.scales.jets(level)
     spread = usual.copy()
     for name, value in context.guess.items():

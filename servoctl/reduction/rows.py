@@ -155,7 +155,7 @@ def as_rows(q, named, kind, context):
     SingularProgram
         If a residual is a square: its gradient vanishes wherever the residual does.
     """
-    rows = [Row(e, max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
+    rows = [Row(q.on_spheres(e), max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
     settled = settle_alone(q, rows, context)
     for row, slopes in settled:
         if row.order < 0:

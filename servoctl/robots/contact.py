@@ -8,12 +8,13 @@ from servoctl.errors import SpecificationError
 from servoctl.robots.joints import identifier, some_posture, unit_quaternions
 from servoctl.robots.robot import Frame, Robot
 from servoctl.spec import rotations
+from servoctl.spec.mechanism import Constraints
 
 HOLDS = ("position", "pose")
 POSTURE_SEED = 20033  # of the postures at which rows are compared
 POSTURES = 3
 ALONE = 1e-6  # [rad, m] largest difference of postures that are one: nothing moves
-FOLLOWS = 1e-9  # part of the largest singular value below which rows of Jacobians depend on others
+FOLLOWS = 1e-5  # part of the largest singular value below which rows of Jacobians depend on others: files with 5 digits
 
 
 def held(robot: Robot, frames, at) -> dict:
@@ -34,7 +35,7 @@ def held(robot: Robot, frames, at) -> dict:
     dict of str to SX
         Rows foot_x, foot_y, foot_z [m] and foot_rx, foot_ry, foot_rz: the vector 2 tan(angle/2) along the axis of the
         rotation from the held orientation [rad], which goes to infinity, not back to zero, at half a turn. Rows that
-        follow from the others wherever all hold are left out.
+        follow from the others wherever all hold are left out; starts satisfy them, too. Rows join by |.
 
     Raises
     ------
@@ -133,7 +134,9 @@ def _without_followers(rows, q, parameters, at):
             do="Name links beyond a joint that moves.",
             rows=list(rows),
         )
-    return {name: row for i, (name, row) in enumerate(rows.items()) if i in kept}
+    names = [list(rows)[i] for i in kept]
+    followers = {name: ca.fmax(ca.fabs(row) - FOLLOWS, 0) for name, row in rows.items() if name not in names}
+    return Constraints({name: rows[name] for name in names}, followers)
 
 
 def _near(q, at, place):
@@ -169,7 +172,7 @@ def _refuse_contradiction(names, kept, evaluate, places, q):
             raise SpecificationError(
                 f"The chain cannot be closed: {names[worst]!r} is {values[worst]:.3g} where the other rows vanish.",
                 "The frames coincide in some posture.",
-                do='Correct the frames, or close their position alone, kind="position".',
+                do="Correct the frames, or cut the chain elsewhere.",
                 row=names[worst],
                 value=float(values[worst]),
             )
@@ -178,13 +181,11 @@ def _refuse_contradiction(names, kept, evaluate, places, q):
 
 def _newton(evaluate, kept, place, q):
     """A posture in which the rows kept vanish, by Newton's iteration from a posture; None where it finds none."""
-    for _ in range(50):
+    for _ in range(50):  # all of them: at a stretched arm each halves what is left
         values, jacobian, frame = (np.array(part) for part in evaluate(place))
         if not np.isfinite(jacobian).all():
             return None
-        if np.abs(values[kept]).max(initial=0.0) < 1e-2 * FOLLOWS:
-            return place
         step = np.linalg.lstsq(jacobian[kept], -values[kept].ravel(), rcond=None)[0]
         place[: q.nq] += frame @ (step * min(1.0, 0.5 / max(np.abs(step).max(), 1e-300)))
         place[: q.nq] = unit_quaternions(q, place[: q.nq])
-    return None
+    return place if np.abs(values[kept]).max(initial=0.0) < 1e-6 * FOLLOWS else None

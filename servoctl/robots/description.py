@@ -56,6 +56,7 @@ class Joint:
     velocity: float = math.inf
     damping: float = 0.0
     friction: float = 0.0
+    armature: float = 0.0
     mimic: tuple[str, float, float] | None = None  # joint, multiplier, offset
 
 
@@ -86,9 +87,12 @@ def described(source):
             f"The root of the document is <{root.tag}>.", "That of a URDF file is <robot>.", tag=root.tag
         )
     links = {name: _inertial(node, name) for name, node in _by_name(root, "link").items()}
-    joints = {name: _joint(node, name) for name, node in _by_name(root, "joint").items()}
+    rotors = _rotors(root)
+    joints = {name: _joint(node, name, rotors.pop(name, 0.0)) for name, node in _by_name(root, "joint").items()}
     if not links:
         raise SpecificationError("The robot has no link.", "A URDF file has at least one <link name=...>.")
+    for rotor in rotors:
+        raise unknown(rotor, joints, "joint (as a rotor drives it)")
     for joint in joints.values():
         _require_known(joint, links, joints)
     return Description(root.get("name") or "robot", links, joints)
@@ -214,15 +218,38 @@ def _by_name(root, tag):
     return found
 
 
+def _rotors(root):
+    """Inertia of rotors as their joints feel it: in Drake's tags, rotor_inertia times gear_ratio squared."""
+    felt = {}
+    for node in root.findall("transmission"):
+        what = f"transmission {node.get('name')!r}"
+        for joint, motor in zip(node.findall("joint"), node.findall("actuator"), strict=False):
+            inertia = _resistance(_one(motor, "drake:rotor_inertia", what), "value", what)
+            ratio = _one_number(_one(motor, "drake:gear_ratio", what), "value", what, 1.0)
+            felt[joint.get("name")] = felt.get(joint.get("name"), 0.0) + inertia * ratio**2
+    return {name: value for name, value in felt.items() if value}
+
+
+def _one(node, tag, what):
+    """The element of a kind within another one, or None."""
+    found = node.findall(tag)
+    if len(found) > 1:
+        raise SpecificationError(
+            f"{what} has {len(found)} elements <{tag}>.", "It has one at most.", do="Remove the others.", tag=tag
+        )
+    return found[0] if found else None
+
+
 def _inertial(link, name):
     """Inertia of a link about its origin; none where it has no <inertial>."""
-    node = link.find("inertial")
+    what = f"link {name!r}"
+    node = _one(link, "inertial", what)
     if node is None:
         return Inertial()
-    rotation, offset = _origin(node, f"the inertial of link {name!r}")
-    what = f"link {name!r}"
-    mass = _one_number(node.find("mass"), "value", what)
-    ixx, ixy, ixz, iyy, iyz, izz = (_one_number(node.find("inertia"), key, what, 0.0) for key in MOMENTS)
+    rotation, offset = _origin(node, f"the inertial of {what}")
+    mass = _one_number(_one(node, "mass", what), "value", f"the <mass> of {what}")
+    tag = _one(node, "inertia", what)
+    ixx, ixy, ixz, iyy, iyz, izz = (_one_number(tag, key, what, 0.0) for key in MOMENTS)
     inertia = ca.DM([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
     if mass < 0.0:
         raise SpecificationError(
@@ -231,7 +258,7 @@ def _inertial(link, name):
     return Inertial(mass, ca.DM.zeros(3), inertia).moved(rotation, offset)
 
 
-def _joint(node, name):
+def _joint(node, name, armature):
     kind, what = node.get("type"), f"joint {name!r}"
     if kind not in JOINTS:
         raise SpecificationError(
@@ -243,7 +270,7 @@ def _joint(node, name):
             type=kind,
         )
     rotation, offset = _origin(node, what)
-    limit, dynamics = node.find("limit"), node.find("dynamics")
+    limit, dynamics = _one(node, "limit", what), _one(node, "dynamics", what)
     turns = kind in ("continuous", "floating", "planar")
     joint = Joint(
         name, kind, _link_of(node, "parent", what), _link_of(node, "child", what), rotation, offset,
@@ -252,7 +279,7 @@ def _joint(node, name):
         upper=math.inf if turns else _one_number(limit, "upper", what, 0.0 if limit is not None else math.inf),
         effort=_one_number(limit, "effort", what, math.inf), velocity=_one_number(limit, "velocity", what, math.inf),
         damping=_resistance(dynamics, "damping", what), friction=_resistance(dynamics, "friction", what),
-        mimic=_mimic(node.find("mimic"), kind, what),
+        armature=armature, mimic=_mimic(_one(node, "mimic", what), kind, what),
     )  # fmt: skip
     if joint.lower > joint.upper:
         raise SpecificationError(
@@ -266,7 +293,7 @@ def _joint(node, name):
 
 
 def _link_of(node, tag, what):
-    found = node.find(tag)
+    found = _one(node, tag, what)
     if found is None or not found.get("link"):
         raise SpecificationError(f"{what} has no <{tag} link=...>.", "A joint has a parent and a child.", joint=what)
     return found.get("link")
@@ -287,7 +314,7 @@ def _mimic(node, kind, what):
 
 def _origin(node, what):
     """Rotation and offset of an element's <origin>; the identity where it has none."""
-    origin = node.find("origin")
+    origin = _one(node, "origin", what)
     if origin is None:
         return np.eye(3), np.zeros(3)
     angles, offset = (_finite_numbers(origin, key, what, "0 0 0") for key in ("rpy", "xyz"))
@@ -295,7 +322,7 @@ def _origin(node, what):
 
 
 def _axis(node, what):
-    axis = np.array(_finite_numbers(node.find("axis"), "xyz", what, "1 0 0"))
+    axis = np.array(_finite_numbers(_one(node, "axis", what), "xyz", what, "1 0 0"))
     if not axis.any():
         raise SpecificationError(f"The axis of {what} is 0 0 0.", "An axis has a direction.", joint=what)
     axis = axis / np.abs(axis).max()  # whose square is in the range of numbers
@@ -305,9 +332,7 @@ def _axis(node, what):
 def _resistance(node, key, what):
     value = _one_number(node, key, what, 0.0)
     if value < 0.0:
-        raise SpecificationError(
-            f"The {key} of {what} is {value:g}.", "It takes energy away: it is at least zero.", "0.", joint=what
-        )
+        raise SpecificationError(f"The {key} of {what} is {value:g}.", "It is at least zero.", "0.", joint=what)
     return value
 
 

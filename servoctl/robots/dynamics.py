@@ -36,7 +36,7 @@ class Kinematics:
     def __init__(self, tree, axes):
         self.tree, self.axes = tree, axes
         self.rotations, self.offsets, self.omega, self.speed = [], [], [], []
-        self.locals = [_local(axis, body.parent is None) for body, axis in zip(tree.bodies, axes, strict=True)]
+        self.locals = list(map(_local, axes))
         self.along = [_carried(axis) for axis in axes]
         for body, axis in zip(tree.bodies, axes, strict=True):
             self._place(body, axis)
@@ -138,8 +138,9 @@ def potential_energy(kinematics, gravity):
     return total
 
 
-def quaternion_rotation(x, y, z, w, twice=2):
-    """The rotation matrix of a quaternion with the scalar w; a unit one, or any with `twice` 2/(x² + y² + z² + w²)."""
+def quaternion_rotation(x, y, z, w):
+    """The rotation matrix of a quaternion with the scalar w, of any length: orthonormal off the unit sphere, too."""
+    twice = 2 / (x * x + y * y + z * z + w * w)
     return ca.vertcat(
         ca.horzcat(1 - twice * (y * y + z * z), twice * (x * y - z * w), twice * (x * z + y * w)),
         ca.horzcat(twice * (x * y + z * w), 1 - twice * (x * x + z * z), twice * (y * z - x * w)),
@@ -147,16 +148,12 @@ def quaternion_rotation(x, y, z, w, twice=2):
     )
 
 
-def _local(axis, first):
-    """Rotation of a body in the frame of its placement, orthonormal for any quaternion but that of a `first` body.
-
-    Of a first body nothing but frames and gravity depends on it, and they are read where the quaternion is a unit one.
-    """
+def _local(axis):
+    """Rotation of a body in the frame of its placement."""
     if axis.motion == "slide":
         return ca.SX.eye(3)
     if axis.motion == "free":
-        quaternion = axis.value[3:]
-        return quaternion_rotation(*quaternion.elements(), 2 if first else 2 / ca.dot(quaternion, quaternion))
+        return quaternion_rotation(*axis.value[3:].elements())
     c, s = ca.cos(axis.value), ca.sin(axis.value)
     return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
 

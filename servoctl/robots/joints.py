@@ -79,11 +79,6 @@ def actuator(name, joint):
     return f"{'force' if joint.kind == 'prismatic' else 'torque'}_{name}"
 
 
-def scalars(q):
-    """Names of the scalars of the quaternions of free bodies."""
-    return tuple(f"{name.removesuffix('_unit')}_qw" for name in q.invariants)
-
-
 def some_posture(q, random):
     """A random posture, (nq,); quaternions of free bodies are unit ones."""
     return unit_quaternions(q, random.uniform(-1.0, 1.0, q.nq))
@@ -91,9 +86,8 @@ def some_posture(q, random):
 
 def unit_quaternions(q, posture):
     """A posture (nq,) whose quaternions of free bodies have length one."""
-    for name in scalars(q):
-        end = q.names.index(name) + 1
-        posture[end - 4 : end] /= np.linalg.norm(posture[end - 4 : end])
+    for e in (list(places) for places, _ in q.spheres):
+        posture[e] /= np.linalg.norm(posture[e])
     return posture
 
 
@@ -122,6 +116,7 @@ def _with_twists(q, tree, places):
             V[q.names.index(name), j] = value
     moved = q.with_quasi_velocities(" ".join(names), V, invariants=invariants)
     moved.units = q.units | dict(zip(names, units, strict=True))
+    moved.identity = {f"{name.removesuffix('_unit')}_qw": 1.0 for name in invariants}
     return moved
 
 

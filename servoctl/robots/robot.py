@@ -1,17 +1,18 @@
 """A robot from its file: coordinates named by joints, frames, limits, and the mechanism of its tree of bodies."""
 
 import math
+import warnings
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_list, column, finite, mapping, named, texts
+from servoctl.checks import as_list, column, finite, mapping, named, numbers_by_name, texts
 from servoctl.errors import SpecificationError
 from servoctl.robots.description import described
 from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
 from servoctl.robots.inertia import require_possible, with_symbols
-from servoctl.robots.joints import actuator, axes_of, scalars
+from servoctl.robots.joints import actuator, axes_of
 from servoctl.robots.tree import ONE_AXIS, tree, with_followers
 from servoctl.spec.mechanism import Mechanism
 from servoctl.values import frozen
@@ -63,10 +64,11 @@ class Robot:
         Names of the frames.
     effort, velocity, position : dict
         Limits of the file: largest force or torque by actuator [N or N m], largest speed [m/s or rad/s] and (low, high)
-        [m or rad] by coordinate. Joints without a limit, or with the 0 of files that state none,
-        are left out.
-    damping, friction : dict of str to float
-        Viscous coefficients [N s/m or N m s] and dry friction [N or N m] by coordinate.
+        [m or rad] by coordinate. Joints without a limit, or with the 0 or -1 of files that state none, are left out;
+        `urdf` warns of these.
+    damping, friction, armature : dict of str to float
+        Viscous coefficients [N s/m or N m s], dry friction [N or N m], and inertia of rotors as their joints feel it
+        [kg or kg m^2], Drake's rotor_inertia times gear_ratio squared, by coordinate.
     """
 
     def __init__(self, description, tree, gravity, parameters):
@@ -81,7 +83,7 @@ class Robot:
         self.position = {
             name: (j.lower, j.upper) for name, j in moving.items() if math.isfinite(j.lower) or math.isfinite(j.upper)
         }
-        self.damping, self.friction = self._resistances("damping"), self._resistances("friction")
+        self.damping, self.friction, self.armature = map(self._resistances, ("damping", "friction", "armature"))
 
     def __repr__(self):
         return f"Robot {self.name!r}: {self.q.n} degrees of freedom\n  coordinates {' '.join(self.q.names)}"
@@ -121,13 +123,12 @@ class Robot:
         NameUnknown
             If one is no coordinate.
         """
-        numbers = {name: 1.0 if name in scalars(self.q) else 0.0 for name in self.q.names}
+        numbers = {name: self.q.identity.get(name, 0.0) for name in self.q.names}
         for name, value in mapping(at, "The posture").items():
             numbers[named(name, self.q.names, "coordinate")] = finite(name, value, "coordinate")
         posture = np.array(list(numbers.values()))
-        for name in scalars(self.q):
-            end = self.q.names.index(name) + 1
-            posture[end - 4 : end] = _unit(self.q.names[end - 4 : end], posture[end - 4 : end])
+        for e in (list(places) for places, _ in self.q.spheres):
+            posture[e] = _unit([self.q.names[i] for i in e], posture[e])
         return posture
 
     def at(self, posture, link):
@@ -153,8 +154,9 @@ class Robot:
         return np.array(position).ravel(), np.array(rotation)
 
     def mechanism(
-        self, constraints=None, actuators=None, *, outputs=None, forces=None, friction=None, parameters=None
-    ) -> Mechanism:
+        self, constraints=None, actuators=None, *, outputs=None, forces=None, friction=None, armature=None,
+        parameters=None,
+    ) -> Mechanism:  # fmt: skip
         """The mechanism of the robot: its balance by the recursive Newton-Euler scheme, gravity and damping.
 
         Figures show each link as a line from the frame of the link that carries it to its own.
@@ -172,6 +174,9 @@ class Robot:
         friction : float, optional
             Speed [rad/s or m/s] below which the file's dry friction c becomes viscous, c tanh(v / friction); 0 leaves
             it out. Needed where the file has friction.
+        armature : dict of str to float, optional
+            Inertia of rotors as the joints feel it [kg or kg m^2], gear ratio squared times that of the rotor, by
+            coordinate: in place of the file's.
         parameters : Parameters, optional
             `robot.parameters.extended(...)`, where constraints and forces have further ones.
 
@@ -187,9 +192,9 @@ class Robot:
         for name, value in mapping(forces, "The forces").items():
             named(name, names, "coordinate" if self.q.plain else "quasi-velocity")
             total[name] += column(value, f"the force on {name!r}", 1)[0]
-        for name, value in zip(names, self._resistance(friction).elements(), strict=True):
+        for name, value in zip(names, self._resistance(friction, armature).elements(), strict=True):
             total[name] += value
-        return Mechanism(
+        mechanism = Mechanism(
             self.q,
             potential=potential_energy(self._kinematics, self._gravity),
             actuators=self._driven(actuators),
@@ -202,6 +207,8 @@ class Robot:
             outputs=outputs,
             shapes=self._lines(),
         )
+        mechanism.passive = tuple(self.effort.keys() - mechanism.actuators)
+        return mechanism
 
     def _lines(self):
         """Each link as a line from the frame of the link that carries it to its own."""
@@ -237,8 +244,8 @@ class Robot:
         """Coefficients of a kind by coordinate."""
         return {name: getattr(j, key) for name, j in self._moving.items() if getattr(j, key)}
 
-    def _resistance(self, friction):
-        """Generalised forces of damping and friction, (n,) SX."""
+    def _resistance(self, friction, armature=None):
+        """Generalised forces of damping, friction and the inertia of rotors, (n,) SX."""
         if friction is None and self.friction:
             named = ", ".join(self.friction)
             raise SpecificationError(
@@ -250,13 +257,15 @@ class Robot:
         speed = finite("friction", 0.0 if friction is None else friction)
         if speed < 0.0:
             raise SpecificationError(f"friction={speed:g} is given.", "It is a speed, at least zero.", "0.")
+        rotors = numbers_by_name(armature, self._moving, "joint that can be driven", "rotor inertia", low=0.0)
+        rotors = {joint.name: rotors.get(name, joint.armature) for name, joint in self._moving.items()}
         rows = ca.SX.zeros(self.q.n)
         for axis, body in zip(self._axes, self._tree.bodies, strict=True):
             joint = body.joint
             if joint is None or joint.kind not in ONE_AXIS:
                 continue
             (row, factor), rate = axis.rows[0], axis.rate[0]
-            load = joint.damping * rate
+            load = joint.damping * rate + rotors.get(joint.name, joint.armature) * axis.acceleration[0]
             if speed and joint.friction:
                 load = load + joint.friction * ca.tanh(rate / speed)
             rows[row] -= factor * load
@@ -276,7 +285,8 @@ class Robot:
 def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
     """Read a robot from a URDF file.
 
-    Fixed and locked joints make one body of their links; meshes, visuals, collisions and transmissions play no part.
+    Fixed and locked joints make one body of their links; meshes, visuals and collisions play no part, nor does
+    a transmission but for Drake's rotor_inertia and gear_ratio of its actuator.
     Joints that mimic others move with them.
 
     Parameters
@@ -312,7 +322,11 @@ def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
     description, lock = with_followers(description, lock)
     bodies = tree(description, base, lock, inertials)
     require_possible(bodies, parameters)
-    return Robot(description, bodies, _field(gravity), parameters)
+    robot = Robot(description, bodies, _field(gravity), parameters)
+    if unstated := [name for name, joint in robot._moving.items() if min(joint.effort, joint.velocity) <= 0.0]:
+        said = f"An effort or a velocity of {', '.join(unstated)} is 0 or less in the file, which states no limit"
+        warnings.warn(f"{said}. State it there, or pass limits={{...}} to sv.plant.", RuntimeWarning, stacklevel=2)
+    return robot
 
 
 def _unit(names, quaternion):

@@ -1,9 +1,11 @@
 """Gibbs-Appell functions of particles (3.8) and rigid bodies (3.11)."""
 
 import casadi as ca
+import numpy as np
 
 from servoctl.checks import column, matrix, require_kind
 from servoctl.errors import SpecificationError
+from servoctl.jets.identity import spread
 from servoctl.spec.coordinates import Coordinates
 
 
@@ -50,7 +52,7 @@ def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rate
     rotation : (3, 3) SX, optional
         Rotation matrix R(q, t) from body to inertial axes; the body rates are taken from RᵀR'.
     rates : (3,) SX or sequence, optional
-        Body rates ω [rad/s], as expressions of the velocities; give this or `rotation`.
+        Body rates ω [rad/s], along the body's axes, as expressions of the velocities; give this or `rotation`.
 
     Returns
     -------
@@ -59,7 +61,7 @@ def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rate
     Raises
     ------
     SpecificationError
-        If neither or both of `rotation` and `rates` are given, or a shape is wrong.
+        If neither or both of `rotation` and `rates` are given, a shape is wrong, or no rotation has these rates.
     """
     if (rotation is None) == (rates is None):
         raise SpecificationError(
@@ -72,7 +74,10 @@ def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rate
     column(mass, "the mass", 1)
     omega = body_rates(q, rotation) if rates is None else ca.vertcat(*column(rates, "rates", 3))
     alpha, J = q.dt(omega), _inertia(inertia)
-    spin = ca.dot(alpha, J @ alpha) / 2 + ca.dot(alpha, ca.cross(omega, J @ omega))
+    gyroscopic = ca.dot(alpha, ca.cross(omega, J @ omega))
+    spin = ca.dot(alpha, J @ alpha) / 2 + gyroscopic
+    if rates is not None and q.order(J) < 0 and not ca.depends_on(J, q.t):
+        _refuse_rates(q, omega, ca.dot(omega, J @ omega) / 2, spin, gyroscopic)
     return spin if position is None else particle(q, mass, position) + spin
 
 
@@ -96,6 +101,39 @@ def body_rates(q: Coordinates, rotation):
         )
     spin = rotation.T @ ca.reshape(q.dt(ca.vec(rotation)), 3, 3)
     return ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
+
+
+def lagrange(q, kinetic):
+    """Vᵀ(d/dt ∂T/∂q' - ∂T/∂q) of T(q, γ'), continued to all q' by w = V⁺(q' - h): (n,) SX."""
+    w, v = ca.vertcat(*q.gamma(1)), ca.SX.sym("v", q.nq)
+    if q.plain:
+        momentum = ca.gradient(kinetic, w)
+        slope = ca.gradient(kinetic, ca.vertcat(*q))
+    else:
+        d, lt, p = ca.ldl(q.V.T @ q.V)
+        left = ca.ldl_solve(q.V.T @ (v - q.h), d, lt, p)
+        continued = ca.substitute(kinetic, w, left)
+        back = q.V @ w + q.h
+        momentum = ca.substitute(ca.gradient(continued, v), v, back)
+        slope = ca.substitute(ca.gradient(continued, ca.vertcat(*q)), v, back)
+    return q.V.T @ (q.dt(momentum) - slope)
+
+
+def _refuse_rates(q, omega, kinetic, spin, gyroscopic):
+    """Refuse rates with which ∂S/∂γ'' are not Lagrange's equations; these hold where γ' spans the motions of q."""
+    if q.nq - q.n != len(q.spheres):
+        return
+    acceleration = ca.vertcat(*q.gamma(2))
+    off = ca.gradient(spin, acceleration) - lagrange(q, kinetic)
+    both = ca.horzcat(off, off - 2 * ca.gradient(gyroscopic, acceleration))
+    body, mirrored = np.nan_to_num(spread(q.on_spheres(both).elements())).reshape(2, -1).any(axis=1)
+    if body:
+        raise SpecificationError(
+            f"The rates are those along {'axes of no body' if mirrored else 'the inertial axes, or left-handed'}.",
+            "Body rates ω = W q' of a rotation have ∂W_i/∂q_j - ∂W_j/∂q_i = W_i × W_j: S then agrees with ω·Jω/2.",
+            do="Pass rotation=R, or the rates Rᵀω along the body's axes, which are right-handed.",
+            inertial=not mirrored,
+        )
 
 
 def _acceleration(q, position, what):

@@ -8,6 +8,7 @@ import casadi as ca
 
 from servoctl.checks import as_list, column, is_whole, mapping, matrix, named, require_kind
 from servoctl.errors import SpecificationError
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero
 from servoctl.jets.tape import Tape, divide, multiply
 from servoctl.units import units_by_name
@@ -66,8 +67,8 @@ class Coordinates:
         self._index = {self.t.element_hash(): ("t", 0, 0)}
         self._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(self._q)}
         self.velocity_names = tuple(f"d{name}" for name in names)
-        self.V, self.h, self.invariants = ca.SX.eye(self.nq), ca.SX.zeros(self.nq), {}
-        self.plain = True
+        self.V, self.h, self.invariants, self.spheres = ca.SX.eye(self.nq), ca.SX.zeros(self.nq), {}, ()
+        self.plain, self.identity = True, {}  # values that a posture has where it is not given, and that are not zero
         self._whole = None  # of a part: the coordinates whose symbols it has, and the places of its velocities there
 
     def __iter__(self):
@@ -146,6 +147,9 @@ class Coordinates:
         other.invariants = {
             k: column(v, f"invariant {k!r}", 1)[0] for k, v in mapping(invariants, "The invariants").items()
         }
+        other.spheres = tuple(filter(None, map(self._sphere, other.invariants.values())))
+        fixed = {i for places, _ in other.spheres for i in places}
+        other.V = ca.vertcat(*(V[i, :] if i in fixed else other.on_spheres(V[i, :]) for i in range(self.nq)))
         _refuse_clash([*self.names, *names])
         for what, expression in (("V", V), ("h", other.h)):
             for s in ca.symvar(expression):
@@ -154,6 +158,23 @@ class Coordinates:
                         f"{what} depends on {s.name()}.", "V and h are functions of q and t (3.1).", name=s.name()
                     )
         return other
+
+    def _sphere(self, invariant):
+        """Places of the coordinates e in an invariant N(e) - c, N homogeneous of degree two, and c/N; None if other."""
+        e = ca.vertcat(*(s for s in self._q if ca.depends_on(invariant, s)))
+        least = ca.substitute(invariant, e, ca.SX.zeros(e.numel()))
+        norm = ca.jtimes(invariant, e, e) / 2
+        if not e.numel() or ca.depends_on(least, self.t) or not vanish(spread([norm - invariant + least])).all():
+            return None
+        return tuple(self.where(s)[2] for s in e.elements()), -least / norm
+
+    def on_spheres(self, expression):
+        """An expression that has its values at unit quaternions for those of any length, also as 1 - 2(y² + z²)."""
+        for places, square in self.spheres:
+            e = ca.vertcat(*(self._q[i] for i in places))
+            if not vanish(spread(ca.jtimes(expression, e, e).elements())).all():
+                expression = ca.substitute(expression, e, e * ca.sqrt(square))
+        return expression
 
     def part(self, places, velocities):
         """Some of the coordinates and velocities, with the same symbols.
@@ -179,7 +200,9 @@ class Coordinates:
             name: value for name, value in self.invariants.items()
             if {s.element_hash() for s in ca.symvar(value)} & known
         }  # fmt: skip
-        other._whole = self, tuple(velocities)
+        at = dict(zip(places, range(len(places)), strict=True))
+        other.spheres = tuple((tuple(at[i] for i in e), square) for e, square in self.spheres if set(e) <= set(at))
+        other._whole, other.identity = (self, tuple(velocities)), self.identity
         return other
 
     def w(self, k=0):
@@ -313,7 +336,7 @@ class Coordinates:
         if self.plain:
             return Coordinates, (self.names, self.units)
         frame = self.as_function([self.V, self.h, *self.invariants.values()])
-        return _moved, (self.names, self.units, self.velocity_names, frame, tuple(self.invariants))
+        return _moved, (self.names, self.units, self.velocity_names, frame, tuple(self.invariants), self.identity)
 
     def _series(self, expressions, k):
         """Coefficients 0 to k of expressions, followed by those of q' = V w + h if these contain q and q' is not w."""
@@ -361,11 +384,13 @@ def symbols_in(expression):
     return [expression] if expression.is_scalar() and expression.is_symbolic() else ca.symvar(expression)
 
 
-def _moved(names, units, velocity_names, frame, invariants):
+def _moved(names, units, velocity_names, frame, invariants, identity):
     """Coordinates with quasi-velocities, unpickled."""
     q = Coordinates(names, units)
     V, h, *values = q.from_function(frame)
-    return q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
+    moved = q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
+    moved.identity = identity
+    return moved
 
 
 def _order(k, least=0):

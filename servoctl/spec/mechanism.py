@@ -14,6 +14,7 @@ from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.markup import Shown, listed
+from servoctl.spec.bodies import lagrange
 from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
@@ -26,6 +27,20 @@ from servoctl.values import Identity
 IDENTITY_SEED = 20021  # of the random points at which identities are tested
 RANDOM = (0.3, 1.3)  # range of these, with parameters in units of their defaults: of order one, and away from zero
 INTEGRABLE = 1e-9  # part of the brackets of V's columns outside their span, relative to the largest bracket
+
+
+class Constraints(dict):
+    """Rows by name, and `followers`: rows left out that hold on a branch of these, which a start is on."""
+
+    def __init__(self, rows, followers):
+        super().__init__(rows)
+        self.followers = followers
+
+    def __or__(self, other):
+        return Constraints({**self, **other}, self.followers | getattr(other, "followers", {}))
+
+    def __ror__(self, other):
+        return Constraints({**other, **self}, self.followers)
 
 
 class Mechanism(Shown):
@@ -107,18 +122,22 @@ class Mechanism(Shown):
         n, self._inverse_dynamics = q.n, None if balance is None else self._known(balance, "the balance", q.n)
         self._mass = None if mass is None else ca.reshape(self._known(ca.vec(mass), "the mass matrix", n * n), n, n)
         self.potential = ca.SX(0) if potential is None else self._known(potential, "the potential")
-        self._applied = self.forces = self._forces(forces)
+        applied, acceleration = self._forces(forces), ca.vertcat(*q.gamma(2))
+        self._applied = self.forces = ca.substitute(applied, acceleration, ca.SX.zeros(n))
+        self._added = self._applied - applied if q.order(applied) > 1 else ca.SX(n, 1)  # forces -m q'' are inertia
         self.actuators = tuple(mapping(actuators, "The actuators"))
         self.E = self._directions(actuators or {})
         self.constraints = self._named(constraints, "constraint")
+        self.followers = self._named(getattr(constraints, "followers", None), "constraint")
         self.outputs = self._named(outputs, "output")
         self.shapes = as_shapes(shapes, self._known)
-        self.inputs, self.reported = (), {}
+        self.inputs, self.reported, self.passive = (), {}, ()
         self._refuse_orders()
         self._keep_names_apart()
         self.units = self._units(units)
         self._check_balance()
         if self._inverse_dynamics is not None:
+            self._refuse_doubled()
             self.forces = self._applied - self._static_forces()
 
     def __repr__(self):
@@ -143,7 +162,7 @@ class Mechanism(Shown):
         names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
         expressions = [
             q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
-            *self.constraints.values(), *self.outputs.values(), *self.shapes.values(),
+            *self.constraints.values(), *self.followers.values(), *self.outputs.values(), *self.shapes.values(),
         ]  # fmt: skip
         function = as_text(q.as_function([*expressions, *self.reported.values()], p.symbols))
         facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
@@ -183,7 +202,8 @@ class Mechanism(Shown):
         q = self.q
         energies = [e for e in (self._gibbs, self._kinetic, self.potential) if e is not None]
         terms = [self.places(term) for energy in energies for term in summands(energy, self.places)]
-        rows = [self._applied] if self._inverse_dynamics is None else [self._applied, self._inverse_dynamics]
+        rows = [self._applied, self._added]
+        rows += [] if self._inverse_dynamics is None else [self._inverse_dynamics]
         terms += [{("w", i), *self.places(row[i])} for row in rows for i in range(q.n)]
         terms += [{("q", i), *self._along(q.V[i, :].T), *self.places(q.h[i])} for i in range(q.nq)]
         terms += [self.places(e) for e in (*q.invariants.values(), *self.constraints.values())]
@@ -253,12 +273,12 @@ class Mechanism(Shown):
         driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
         driven = Mechanism(
             self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
-            balance=self._inverse_dynamics, mass=self._mass, forces=self.forces + forces + driving,
+            balance=self._inverse_dynamics, mass=self._mass, forces=self.forces - self._added + forces + driving,
             constraints=self.constraints, outputs={**self.outputs, **inputs},
             shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
-        driven.units, driven.longer = self.units, self.longer
+        driven.units, driven.longer, driven.followers = self.units, self.longer, self.followers
         return driven
 
     @property
@@ -275,42 +295,32 @@ class Mechanism(Shown):
         elif self._gibbs is not None:
             inertial = ca.gradient(self._gibbs, ca.vertcat(*self.q.gamma(2)))
         else:
-            inertial = self._lagrange()
+            inertial = lagrange(self.q, self._kinetic)
+        inertial = inertial + self._added
         return cse(inertial - self._applied + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
 
     @cached_property
     def mass(self):
-        """The inertia matrix M = ∂r/∂γ'', (n, n) SX."""
-        return ca.jacobian(self.balance, ca.vertcat(*self.q.gamma(2))) if self._mass is None else self._mass
+        """The inertia matrix M = ∂r/∂γ'', (n, n) SX, with that of forces which contain accelerations."""
+        acceleration = ca.vertcat(*self.q.gamma(2))
+        if self._mass is None:
+            return ca.jacobian(self.balance, acceleration)
+        return self._mass + ca.jacobian(self._added, acceleration)
 
     @cached_property
     def energy(self):
         """Kinetic plus potential energy [J], SX; without a kinetic energy T it is taken as wᵀMw/2."""
-        w = ca.vertcat(*self.q.gamma(1))
-        kinetic = ca.dot(w, self.mass @ w) / 2 if self._kinetic is None else self._kinetic
-        return kinetic + self.potential
-
-    def _lagrange(self):
-        """Vᵀ(d/dt ∂T/∂q' - ∂T/∂q), T continued to all q' by w = V⁺(q' - h)."""
-        q = self.q
-        w, v = ca.vertcat(*q.gamma(1)), ca.SX.sym("v", q.nq)
-        if q.plain:
-            momentum = ca.gradient(self._kinetic, w)
-            slope = ca.gradient(self._kinetic, ca.vertcat(*q))
-        else:
-            d, lt, p = ca.ldl(q.V.T @ q.V)
-            left = ca.ldl_solve(q.V.T @ (v - q.h), d, lt, p)
-            continued = ca.substitute(self._kinetic, w, left)
-            back = q.V @ w + q.h
-            momentum = ca.substitute(ca.gradient(continued, v), v, back)
-            slope = ca.substitute(ca.gradient(continued, ca.vertcat(*q)), v, back)
-        return q.V.T @ (q.dt(momentum) - slope)
+        w, acceleration = (ca.vertcat(*self.q.gamma(k)) for k in (1, 2))
+        inertia = self.mass if self._kinetic is None else ca.jacobian(self._added, acceleration)
+        return ca.dot(w, inertia @ w) / 2 + (0 if self._kinetic is None else self._kinetic) + self.potential
 
     def _check_balance(self):
-        if self._gibbs is None and self._kinetic is None and self._inverse_dynamics is None:
+        given = {"gibbs": self._gibbs, "kinetic": self._kinetic, "balance": self._inverse_dynamics, "mass": self._mass}
+        sources = {name for name, value in given.items() if value is not None}
+        if not sources or sources >= {"gibbs", "balance"} or sources & {"mass", "balance"} == {"mass"}:
             raise SpecificationError(
-                "The mechanism has no inertia.",
-                "Inertia comes from a Gibbs function, a kinetic energy or a balance.",
+                f"The mechanism has {' and '.join(sorted(sources)) or 'no inertia'}.",
+                "Inertia comes from a Gibbs function, a kinetic energy, or a balance, perhaps with its mass matrix.",
                 do="Pass gibbs=sv.particle(...) + ..., kinetic=T or balance=r.",
                 coordinates=list(self.q.names),
             )
@@ -329,7 +339,7 @@ class Mechanism(Shown):
             )  # fmt: skip
         self._refuse_asymmetry()
         if self._gibbs is not None and self._kinetic is not None:
-            difference = ca.gradient(self._gibbs, acceleration) - self._lagrange()
+            difference = ca.gradient(self._gibbs, acceleration) - lagrange(self.q, self._kinetic)
             components = zip(self.q.jet_names(2), difference.elements(), strict=True)
             different = [name for name, component in components if not self.is_zero([component])]
             if different:
@@ -341,15 +351,15 @@ class Mechanism(Shown):
                 )
 
     def _refuse_asymmetry(self):
-        """Refuse a given balance whose mass matrix is not symmetric."""
-        if self._inverse_dynamics is None:
+        """Refuse a balance or forces whose mass matrix is not symmetric, and a `mass` that is not the balance's."""
+        if self._inverse_dynamics is None and not self._added.nnz():
             return
         names, n = self.q.jet_names(2), self.q.n
         factor = self.q.gamma(2)[0]  # the difference of two constants would be folded, and its rounding has no size
         pairs = list(itertools.combinations(range(n), 2))
         for i, j in self._different([(self.mass[i, j] * factor, self.mass[j, i] * factor) for i, j in pairs], pairs):
             raise SpecificationError(
-                f"The balance has {names[j]} in row {i} and {names[i]} in row {j} with different factors.",
+                f"The balance less forces has {names[j]} in row {i} and {names[i]} in row {j} with different factors.",
                 "The mass matrix ∂r/∂γ'' is symmetric where the rows are generalised forces of the coordinates; "
                 "kinetic energy and ideal reactions need it.",
                 do="Undo combinations of rows, such as a partial linearisation, or pass gibbs= or kinetic=.",
@@ -359,7 +369,7 @@ class Mechanism(Shown):
             return
         slope = ca.jacobian(self._inverse_dynamics, ca.vertcat(*self.q.gamma(2)))
         pairs = [*pairs, *((i, i) for i in range(n))]
-        for i, j in self._different([(self.mass[i, j] * factor, slope[i, j] * factor) for i, j in pairs], pairs):
+        for i, j in self._different([(self._mass[i, j] * factor, slope[i, j] * factor) for i, j in pairs], pairs):
             raise SpecificationError(
                 f"The mass matrix has another entry ({i}, {j}) than the factor of {names[j]} in the balance.",
                 "`mass` is ∂r/∂γ'' of `balance`.",
@@ -372,6 +382,28 @@ class Mechanism(Shown):
         values, sizes = self.at_random([a - b for a, b in couples]) if couples else (np.zeros((0, 4)), 0.0)
         differs = np.any(np.abs(values) > ENTRY * sizes, axis=1)
         return [label for label, other in zip(labels, differs, strict=True) if other]
+
+    def _refuse_doubled(self):
+        """Refuse a balance that contains what is passed beside it, at rest or odd in the velocities as damping is."""
+        q, speed, acceleration = self.q, *(ca.vertcat(*self.q.gamma(k)) for k in (1, 2))
+
+        def parts(load):
+            load = ca.substitute(load, acceleration, ca.SX.zeros(q.n))
+            odd = load - ca.substitute(load, speed, -speed)
+            return acceleration[0] * ca.vertcat(ca.substitute(load, speed, ca.SX.zeros(q.n)), odd)  # no constant
+
+        loads = self._inverse_dynamics, q.V.T @ ca.gradient(self.potential, ca.vertcat(*q)), -self._applied
+        own, gravity, forces = map(parts, loads)
+        some = self._different([(e, 0) for e in own.elements()], range(2 * q.n))
+        for name, beside in {"potential": gravity, "forces": forces, "potential and forces": gravity + forces}.items():
+            other = self._different([(own[i], beside[i]) for i in some], some)
+            if rows := sorted({q.force_names[i % q.n] for i in some if i not in other}):
+                raise SpecificationError(
+                    f"The balance contains the {name} passed beside it, in {', '.join(rows)}.",
+                    "`balance` is r without `potential` and `forces`; these would count twice.",
+                    do="Leave them out, as with balance=mechanism.balance, or pass the balance without them.",
+                    components=rows,
+                )
 
     def _static_forces(self):
         """What a given balance is at rest, such as gravity, (n,) SX; the rest is inertia and has a kinetic energy."""
@@ -432,7 +464,7 @@ class Mechanism(Shown):
         """An SX scalar or column in symbols of the mechanism."""
         expression = ca.vertcat(*settled(column(value, what, size)))
         require_known(expression, self, what)
-        return expression
+        return self.q.on_spheres(expression)
 
     def _named(self, values, what):
         named = mapping(values, f"The {what}s").items()
@@ -514,7 +546,7 @@ class Mechanism(Shown):
             ("The kinetic energy", {"": self._kinetic}, 1),
             ("The Gibbs function", {"": self._gibbs}, 2),
             ("The balance", {"": self._inverse_dynamics}, 2),
-            ("The forces", {"": self.forces}, 2),
+            ("The forces", {"": self.forces - self._added}, 2),
             ("The material constraint", self.constraints, 2),
             ("The shape", self.shapes, 0),
         ):
@@ -556,12 +588,15 @@ def _part(identity, places):
 
     part.q, part.parameters = q.part(coordinates, velocities), whole.parameters
     part._gibbs, part._kinetic, part.potential = map(terms, (whole._gibbs, whole._kinetic, whole.potential))
-    part._inverse_dynamics, part._applied, part.forces = map(
-        rows, (whole._inverse_dynamics, whole._applied, whole.forces)
+    part._inverse_dynamics, part._applied, part._added, part.forces = map(
+        rows, (whole._inverse_dynamics, whole._applied, whole._added, whole.forces)
     )
     part._mass = None if whole._mass is None else whole._mass[velocities, velocities]
     part.actuators, part.E = tuple(whole.actuators[j] for j in columns), whole.E[velocities, columns]
-    part.constraints = {name: e for name, e in whole.constraints.items() if whole.places(e) <= places}
+    part.constraints, part.followers = (
+        {name: e for name, e in rows.items() if whole.places(e) <= places}
+        for rows in (whole.constraints, whole.followers)
+    )
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
     part.shapes = {name: e for name, e in whole.shapes.items() if whole.places(e) <= places}
     part.units, part.longer = whole.units, whole.longer

@@ -137,8 +137,14 @@ def vector(rotation):
     (3,) SX
     """
     rotation = as_rotation(rotation, "the rotation")
-    skew = rotation - rotation.T
-    return 2 * ca.vertcat(skew[2, 1], skew[0, 2], skew[1, 0]) / (1 + ca.trace(rotation))
+    skew, power = ca.inv_skew(rotation - rotation.T), (1 + ca.trace(rotation)) / 4
+    # With c = cos²(angle/2), skew·skew = 16 c (1 - c). Near half a turn 1 + trace = 4 c is rounding, and 2 skew/4c is
+    # zero where the skew part is: there c is skew·skew (1 + c + ... + c^63)/16, and only its rest c^65 by the trace.
+    series = ca.dot(skew, skew) / 16
+    rest = power
+    for _ in range(6):
+        series, power = series * (1 + power), power * power
+    return skew / (2 * (series + rest * power))
 
 
 def as_rotation(value, what):

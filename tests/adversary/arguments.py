@@ -284,7 +284,7 @@ def specifications():
         "q.where": (q.where, dict(symbol=x)),
         "particle": (sv.particle, dict(q=q, mass=2.0, position=(x, y))),
         "rigid_body": (sv.rigid_body, dict(q=turn, mass=2.0, inertia=(1.0, 1.0, 2.0), position=None, rotation=about_z)),
-        "rigid_body rates": (sv.rigid_body, dict(q=turn, mass=2.0, inertia=(1.0, 1.0, 2.0), rates=turn.d())),
+        "rigid_body rates": (sv.rigid_body, dict(q=turn, mass=2.0, inertia=(1.0, 1.0, 2.0), rates=[0, 0, turn.d()[0]])),
         "body_rates": (sv.body_rates, dict(q=turn, rotation=about_z)),
         "Mechanism": (sv.Mechanism, dict(q=q, potential=x**2, actuators={"pull": x, "lift": y}, forces={"x": -x},
                                          constraints={"rail": y}, outputs={"far": x + y}, **plain)),
