@@ -218,8 +218,8 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
     method, drift = _method_and_drift(model, method, drift, t0, t1)
-    leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
-    x0 = (as_state if leads_back else consistent_state)(model, start, t0)
+    leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, Poles)
+    x0 = as_state(model, start, t0) if leads_back else consistent_state(model, start, t0, isinstance(drift, Project))
     knots = model.require_smooth((min(span), max(span)))
     if not isinstance(method, Algebraic):
         knots = tuple(sorted({*knots, *model.ends_of_pieces((min(span), max(span))).tolist()}))
@@ -577,19 +577,29 @@ def _scaled_residuals(model, t, x):
     return names, values, np.fmin(np.fmax(off, 0.0), np.finfo(float).max)
 
 
-def consistent_state(model, start, t):
-    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
+def consistent_state(model, start, t, project=False):
+    """The state that a start gives, or its projection, which must satisfy the invariants: nothing would lead back."""
     x = as_state(model, start, t)
+    x = _projected(model, t, x) if project else x
     names, values, off = _scaled_residuals(model, t, x)
     if off.max(initial=0.0) > OFF:
         worst = int(np.argmax(off))
         raise InconsistentStart(
-            f"The start leaves the residual {values[worst]:.3g} of {names[worst]!r}.",
+            f"The start{' after projection' * project} leaves the residual {values[worst]:.3g} of {names[worst]!r}.",
             "It must satisfy every constraint at every level, or the whole motion violates them.",
-            do="Complete it by model.start(guess={...}), or use drift='project', which corrects it.",
+            do="Complete it by model.start(guess={...})"
+            + ("." if project else ", or use drift='project', which corrects it."),
             invariant=names[worst],
             residual=float(values[worst]),
         )
+    return x
+
+
+def _projected(model, t, x):
+    """The state nearest to x that satisfies the invariants, by their projection as long as it brings x nearer."""
+    restore, off, nearer = model.function("ode_projected").restore, np.inf, x
+    while (now := np.abs(_scaled_residuals(model, t, nearer)[2]).max(initial=0.0)) < off:
+        x, off, nearer = nearer, now, restore(t, nearer, model.parameters)
     return x
 
 
