@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import needs
 from refusals import refused
 from scipy.special import ellipj
 
@@ -60,3 +61,68 @@ def test_the_least_change_of_a_start_is_that_of_its_masses():
 def test_a_start_that_projection_does_not_bring_to_the_constraint_is_refused(pendulum):
     with refused(sv.InconsistentStart, "model.start", invariant="rod"):
         sv.simulate(pendulum, [0.0, 0.0, 0.0, 0.0], (0.0, 1.0), drift="project")
+
+# edges of disturbances -----------------------------------------------------------------------------------------------
+
+MASS, FREE, SPAN = 10.0, sv.coordinates("x"), 2.0  # kg; m; s
+
+
+@pytest.fixture(scope="module")
+def free():
+    """A mass on a rail, and a law that lets go of it."""
+    (x,) = FREE
+    mechanism = sv.Mechanism(FREE, sv.particle(FREE, MASS, x), actuators={"F": x})
+    model, plant = sv.derive(mechanism, sv.Program({"rest": x}, by="actuators")), sv.plant(mechanism)
+    return plant, sv.feedforward(sv.simulate(model, model.start(), (0.0, SPAN)), plant)
+
+
+def told(f, **what):
+    """A function that says what integration must know of it."""
+    vars(f).update(what)
+    return f
+
+
+def noisy(std, bandwidth, seed):
+    """The disturbance, and the impulse of its harmonics, in closed form."""
+    force, random = sv.disturbances.noise(std, bandwidth, seed), np.random.default_rng(seed)
+    f = (np.arange(64) + random.uniform(size=64)) * bandwidth / 64
+    phase = random.uniform(0, 2 * np.pi, 64)
+    swings = (np.sin(2 * np.pi * f * SPAN + phase) - np.sin(phase)) / (2 * np.pi * f)
+    return force, std * np.sqrt(2 / 64) * swings.sum()
+
+
+GUST, STEP = sv.disturbances.gust, sv.disturbances.step
+PUSHES = {  # force, its impulse [N s]; the issue's gust at eight instants, and others
+    **{f"gust at {t0}": (GUST(2000.0, t0, t0 + 2e-3), 4.0) for t0 in (1.0, 1.001, 1.0033, 1.0055, 1.006, 1.0099, 0.0)},
+    "gust to the end": (GUST(2000.0, SPAN - 3e-3, SPAN + 3.0), 6.0),
+    "smooth gust": (GUST(2000.0, 1.0031, 1.0051, rise=1e-3), 2.0),
+    "ramps over samples": (GUST(50.0, 0.5037, 1.1111, rise=0.2003), 50.0 * (1.1111 - 0.5037 - 0.2003)),
+    "step": (STEP(100.0, 0.7137), 100.0 * (SPAN - 0.7137)),
+    "own pulse": (told(lambda t: 2000.0 * (1.0033 < t < 1.0053), edges=(1.0033, 1.0053)), 4.0),
+    "own bump": (told(lambda t: 2e3 * np.exp(-(((t - 1.0033) / 4e-4) ** 2)), longest=2e-4), 0.8 * np.sqrt(np.pi)),
+    "fast noise": noisy(50.0, 500.0, 3),
+}
+
+
+@pytest.mark.parametrize("name", PUSHES)
+def test_a_push_has_its_impulse_wherever_it_lies(name, free, backend):
+    (plant, law), (force, impulse) = free, PUSHES[name]
+    loop = sv.close(plant, law, {"x": 0.0, "dx": 0.0}, (0.0, SPAN), disturbance={"x": force})
+    size = {"fast noise": 1e-5}.get(name, 1e-9)  # by Simpson's rule
+    assert loop["dx"][-1] * MASS == pytest.approx(impulse, abs=size * max(1.0, abs(impulse)))
+    many = sv.close_many(loop, {"wind": [1.0, -0.5]}, scale={"x": "wind"})
+    assert many["final dx"] * MASS == pytest.approx([impulse, -impulse / 2], abs=size * max(1.0, abs(impulse)))
+    assert sv.verify(loop).passed
+
+
+def test_a_push_has_its_impulse_in_mujoco(free):
+    mujoco = needs("mujoco")
+    scene = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>'
+        '<geom size="0.1" mass="10"/></body></worldbody><actuator><motor name="F" joint="x"/></actuator></mujoco>'
+    )
+    plant, law = free
+    push = {"x": GUST(2000.0, 1.0033, 1.0053)}
+    loop = sv.interop.mujoco(scene, law, {"x": 0.0, "dx": 0.0}, (0.0, SPAN), plant=plant, disturbance=push)
+    assert loop["dx"][-1] == pytest.approx(0.4, abs=1e-9)
+    assert scene.opt.timestep == 0.01

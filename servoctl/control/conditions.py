@@ -8,6 +8,7 @@ import numpy as np
 from servoctl.checks import (
     MOST_COUNT,
     ON_SAMPLE,
+    array_of,
     mapping,
     named,
     numbers_by_name,
@@ -159,13 +160,34 @@ class Conditions:
             object.__setattr__(self, name, value)
         object.__setattr__(self, "disturbance", dict(mapping(self.disturbance, "The disturbances")))
 
-    def forces(self, t0, h, count):
-        """Disturbances at the start, middle and end of each integration step, (count, 3, n_d); None without any."""
-        if not self.disturbance:
-            return None
-        starts = t0 + np.arange(count)[:, None] * h
-        t = starts + np.array([WITHIN_STEP, 0.5, 1 - WITHIN_STEP]) * h
-        return np.stack([sampled(name, f, t) for name, f in self.disturbance.items()], axis=-1)
+    def forces(self, t0, h, count, finer=1):
+        """The disturbances of a `Loop` in its integration steps, so many of length h [s] from t0 on.
+
+        Steps end at the `edges` of a disturbance, and are cut into equal ones that are at most its `longest`; these
+        parts are cut once more into so many (`finer`).
+        """
+        functions = self.disturbance.values()
+        if not functions and finer == 1:
+            return dict.fromkeys(("disturbance", "parts", "spans"))
+        longest = min((positive("longest", getattr(f, "longest", h)) for f in functions), default=h)
+        n = max(1, int(np.ceil(h / longest - ON_SAMPLE)))
+        require_memory(count * n * finer, 3 * len(functions) + 3, f"A disturbance needs steps of {h / n:.3g} s")
+        edges = np.unique([e for f in functions for e in array_of("edges", getattr(f, "edges", ()), None).tolist()])
+        inside = max(WITHIN_STEP * h / n, 2 * np.spacing(abs(t0) + count * h))
+        apart = np.abs((edges - t0) * n / h - np.rint((edges - t0) * n / h)) * h / n
+        apart = np.minimum(apart, np.diff(edges, prepend=-np.inf))
+        edges = edges[(apart > inside) & (edges > t0) & (edges < t0 + count * h)]
+        step = np.append(np.arange(count * n) // n, ((edges - t0) // h).astype(np.int64))
+        begin = np.append(np.arange(count * n) % n * h / n, edges - t0 - step[count * n :] * h)
+        order = np.lexsort((begin, step))
+        step, begin = np.repeat(step[order], finer), begin[order]
+        length = (np.append(np.where(np.diff(step[::finer]) == 0, begin[1:], h), h) - begin)[:, None] / finer
+        begin, length = (begin[:, None] + np.arange(finer) * length).ravel(), np.repeat(length, finer)
+        t = (t0 + step * h + begin)[:, None] + np.stack([inside + 0 * length, length / 2, length - inside], axis=1)
+        values = [sampled(name, f, t) for name, f in self.disturbance.items()]
+        parts = np.searchsorted(step, np.arange(count + 1)) if len(step) > count else None
+        values = np.stack(values, axis=-1) if values else np.zeros((*t.shape, 0))
+        return {"disturbance": values, "parts": parts, "spans": np.stack([begin, length], axis=1)}
 
 
 def _by_measure(values, measures):

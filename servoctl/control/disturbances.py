@@ -48,6 +48,11 @@ class Gust:
                 rise=self.rise,
             )
 
+    @property
+    def edges(self):
+        """Instants at which integration steps end [s]: both edges and, as a step sees one radian at most, within them."""
+        return np.add.outer([self.start, self.end - self.rise], np.linspace(0, self.rise, 5)).ravel()
+
     def __call__(self, t):
         """The force at times t [s]."""
         t = np.asarray(t, dtype=float)
@@ -75,6 +80,8 @@ class Step:
 
     def __post_init__(self):
         _as_floats(self)
+
+    edges = property(lambda self: (self.at,), doc="Instants at which integration steps end [s].")
 
     def __call__(self, t):
         """The force at times t [s]."""
@@ -117,6 +124,11 @@ class Noise:
                 std=self.std,
                 bandwidth=self.bandwidth,
             )
+
+    @property
+    def longest(self):
+        """The longest integration step [s]: one radian of the highest harmonic, where Simpson's rule errs by 1/2880."""
+        return 1 / (2 * np.pi * self.bandwidth)
 
     def __call__(self, t):
         """The force at times t [s]."""
