@@ -6,8 +6,12 @@ import pytest
 from conftest import needs
 from refusals import refused
 from scipy.special import ellipj
+from test_export_c import Exported
 
 import servoctl as sv
+from servoctl.checks import column, matrix
+from servoctl.export.c import export_c
+from servoctl.gallery import gallery
 
 # a projected start ----------------------------------------------------------------------------------------------------
 
@@ -61,6 +65,7 @@ def test_the_least_change_of_a_start_is_that_of_its_masses():
 def test_a_start_that_projection_does_not_bring_to_the_constraint_is_refused(pendulum):
     with refused(sv.InconsistentStart, "model.start", invariant="rod"):
         sv.simulate(pendulum, [0.0, 0.0, 0.0, 0.0], (0.0, 1.0), drift="project")
+
 
 # edges of disturbances -----------------------------------------------------------------------------------------------
 
@@ -126,3 +131,58 @@ def test_a_push_has_its_impulse_in_mujoco(free):
     loop = sv.interop.mujoco(scene, law, {"x": 0.0, "dx": 0.0}, (0.0, SPAN), plant=plant, disturbance=push)
     assert loop["dx"][-1] == pytest.approx(0.4, abs=1e-9)
     assert scene.opt.timestep == 0.01
+
+
+# numbers that are none -----------------------------------------------------------------------------------------------
+
+COMPLEX = [2 + 3j, np.complex64(2 + 3j), np.complex128(2), np.clongdouble(2 + 3j), np.array(2 + 3j, np.complex64)]
+(X,) = FREE
+DOORS = {
+    "parameter": lambda v: sv.parameters(m=v),
+    "mass": lambda v: sv.particle(FREE, v, X),
+    "potential": lambda v: sv.Mechanism(FREE, sv.particle(FREE, 1.0, X), potential=v),
+    "gibbs": lambda v: sv.Mechanism(FREE, v),
+    "residual": lambda v: sv.Program({"X": X - FREE.t, "Y": v}),
+    "slowed program": lambda v: sv.Program({"X": X - FREE.t}).slowed(FREE, v),
+    "path": lambda v: sv.paths.rest_to_rest(FREE.t, 0.0, v, 1.0),
+    "points of a path": lambda v: sv.paths.spline(FREE.t, [0.0, 1.0, 2.0], [0.0, v, 1.0]),
+    "gust": lambda v: GUST(v, 0.0, 1.0),
+    "rate": lambda v: sv.Timing(rate=v),
+    "tolerance": lambda v: sv.Taylor(rtol=v),
+    "axes of a circle": lambda v: sv.paths.circle(FREE.t, (0.0, 0.0), 1.0, axes=v),
+}
+
+
+@pytest.mark.parametrize("value", COMPLEX, ids=lambda v: type(v).__name__)
+@pytest.mark.parametrize("door", DOORS)
+def test_a_complex_number_is_refused(door, value):
+    with pytest.raises(sv.SpecificationError):
+        DOORS[door](value)
+
+
+@pytest.mark.parametrize("kind", [np.longdouble, np.float16, np.int8])
+def test_numbers_of_numpy_are_those_of_python(kind):
+    """CasADi has no place for those that are longer than doubles."""
+    array = np.array([0, 2], kind)
+    for value in (kind(2), array[1:], [kind(2)]):
+        assert [float(entry) for entry in column(value, "it")] == [2.0]
+    assert np.array_equal(ca.DM(matrix([list(array), list(array)], "it")), [[0, 2], [0, 2]])
+
+
+@pytest.mark.parametrize("name", ["overhead-crane", "passive-arm", "vtol-centre"])  # by Newton, by states
+def test_exported_c_answers_numbers_or_its_error(name, gallery_model, tmp_path, c_compiler):
+    scene, model = gallery[name], gallery_model(name)
+    start, answered = model.start(**scene.start, guess=scene.guess), []
+    plan = Exported(export_c(model, tmp_path, name="plan", start=start), "plan")
+    for k in range(len(model.parameters)):
+        for bad in (np.nan, np.inf):
+            x, p = start.values.copy(), model.parameters.copy()
+            p[k] = bad
+            z, u = np.full(len(model.jet_names), 7.0), np.full(len(model.actuators), 7.0)
+            code = plan("feedforward", start.t, x, p, z, u)
+            answered.append(code)
+            assert np.isfinite(z).all() and np.isfinite(u).all()
+            assert code >= 0 or set(z) == {7.0} and set(u) == {7.0}
+            if not model.flat:
+                assert plan("advance", start.t, 0.01, x, p) in (0, -1) and np.isfinite(x).all()
+    assert -1 in answered

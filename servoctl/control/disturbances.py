@@ -50,7 +50,7 @@ class Gust:
 
     @property
     def edges(self):
-        """Instants at which integration steps end [s]: both edges and, as a step sees one radian at most, within them."""
+        """Instants at which integration steps end [s]: those of both edges, and within them, at most a radian apart."""
         return np.add.outer([self.start, self.end - self.rise], np.linspace(0, self.rise, 5)).ravel()
 
     def __call__(self, t):
