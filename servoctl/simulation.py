@@ -579,8 +579,9 @@ def _scaled_residuals(model, t, x):
 
 def consistent_state(model, start, t, project=False):
     """The state that a start gives, or its projection, which must satisfy the invariants: nothing would lead back."""
-    x = as_state(model, start, t)
-    x = _projected(model, t, x) if project else x
+    x, before = as_state(model, start, t), np.inf
+    while project and (off := np.abs(_scaled_residuals(model, t, x)[2]).max(initial=0.0)) < before:
+        x, before = model.function("ode_projected").restore(t, x, model.parameters), off
     names, values, off = _scaled_residuals(model, t, x)
     if off.max(initial=0.0) > OFF:
         worst = int(np.argmax(off))
@@ -592,14 +593,6 @@ def consistent_state(model, start, t, project=False):
             invariant=names[worst],
             residual=float(values[worst]),
         )
-    return x
-
-
-def _projected(model, t, x):
-    """The state nearest to x that satisfies the invariants, by their projection as long as it brings x nearer."""
-    restore, off, nearer = model.function("ode_projected").restore, np.inf, x
-    while (now := np.abs(_scaled_residuals(model, t, nearer)[2]).max(initial=0.0)) < off:
-        x, off, nearer = nearer, now, restore(t, nearer, model.parameters)
     return x
 
 

@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import needs
+from numpy.polynomial import Polynomial
 from refusals import refused
 from scipy.special import ellipj
 from test_export_c import Exported
@@ -12,6 +13,7 @@ import servoctl as sv
 from servoctl.checks import column, matrix
 from servoctl.export.c import export_c
 from servoctl.gallery import gallery
+from servoctl.inversion.verdict import verdict
 
 # a projected start ----------------------------------------------------------------------------------------------------
 
@@ -186,3 +188,138 @@ def test_exported_c_answers_numbers_or_its_error(name, gallery_model, tmp_path, 
             if not model.flat:
                 assert plan("advance", start.t, 0.01, x, p) in (0, -1) and np.isfinite(x).all()
     assert -1 in answered
+
+
+# integrals of a program ----------------------------------------------------------------------------------------------
+
+
+def rate(path, q):
+    return ca.jacobian(path, q.t)
+
+
+def cart_and_pole(by, damping=0.0):
+    """The tutorial's machine, programmed by its place, by its speed, or by the speed of the bob."""
+    p, q = sv.parameters(M=2.0, m=0.5, L=0.6, g=G), sv.coordinates("x theta")
+    (x, theta), (dx, _) = q, q.d(1)
+    bob = ca.vertcat(x + p.L * ca.sin(theta), p.L * ca.cos(theta))
+    mechanism = sv.Mechanism(
+        q, sv.particle(q, p.M, x) + sv.particle(q, p.m, bob), potential=p.m * p.g * bob[1], actuators={"F": x},
+        forces={"x": -damping * dx}, parameters=p,
+    )  # fmt: skip
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.5, smoothness=4)
+    residual = {"place": x - path, "speed": dx - rate(path, q)}
+    return mechanism, sv.Program(residual if by is None else {by: residual[by]})
+
+
+@pytest.mark.parametrize("damping", [0.0, 3.0])
+def test_a_program_of_a_speed_has_the_inverse_of_its_place(damping):
+    place, speed = (sv.inverse(*cart_and_pole(by, damping), (0.0, 1.5)) for by in ("place", "speed"))
+    assert "inverse: bounded" in speed.message and "0 is the constant of x" in speed.message
+    assert damping or np.abs(place["F"]).max() == pytest.approx(9.28, abs=5e-3)  # N, of the tutorial
+    for name in ("F", "x", "theta"):
+        assert np.abs(speed[name] - place[name]).max() < 1e-9 * np.abs(place[name]).max()
+    assert sv.verify(speed.model, speed).passed
+
+
+def segway(by):
+    """Two wheels of 0.25 m that roll without slipping, and a body that stands on their axle."""
+    q = sv.coordinates("x y psi a left right")
+    (x, y, psi, a, left, right), (dx, dy, dpsi, _, dleft, dright) = q, q.d(1)
+    forward, side = ca.vertcat(ca.cos(psi), ca.sin(psi), 0), ca.vertcat(-ca.sin(psi), ca.cos(psi), 0)
+    axle = ca.vertcat(x, y, 0.25)
+    body = axle + 0.7 * ca.sin(a) * forward + ca.vertcat(0, 0, 0.7 * ca.cos(a))
+    spins = 0.75 * q.d(2)[2] ** 2 + 0.03 * (q.d(2)[4] ** 2 + q.d(2)[5] ** 2)
+    v = dx * ca.cos(psi) + dy * ca.sin(psi)
+    rolling = {"l": v - 0.3 * dpsi - 0.25 * dleft, "r": v + 0.3 * dpsi - 0.25 * dright}
+    mechanism = sv.Mechanism(
+        q, spins + sv.particle(q, 30.0, body) + sum(sv.particle(q, 2.0, axle + s * side) for s in (-0.3, 0.3)),
+        potential=30.0 * G * body[2], constraints={"slide": dy * ca.cos(psi) - dx * ca.sin(psi), **rolling},
+        actuators={"L": left - a, "R": right - a},
+    )  # fmt: skip
+    along, turn = (sv.paths.rest_to_rest(q.t, 0.0, end, 3.0, smoothness=5) for end in (3.0, 1.2))
+    heading = {"heading": psi - turn} if by == "heading" else {"rate": dpsi - rate(turn, q)}
+    return mechanism, sv.Program({"speed": v - rate(along, q), **heading})
+
+
+def test_a_segway_by_its_speed_and_its_rate_of_turn_stays_upright_and_exact():
+    heading, speed = (sv.inverse(*segway(by), (0.0, 3.0)) for by in ("heading", "rate"))
+    assert "inverse: bounded" in speed.message and "constant of x, y, psi, left, right" in speed.message
+    for name in ("L", "R", "a", "x", "y", "psi"):
+        assert np.abs(speed[name] - heading[name]).max() < 1e-8 * np.abs(heading[name]).max()
+    way = 3.0 * np.array([np.sin(1.2), 1.0 - np.cos(1.2)]) / 1.2  # as both follow the same blend
+    assert [speed["x"][-1], speed["y"][-1]] == pytest.approx(way, abs=1e-9)
+    assert sv.verify(speed.model, speed).passed
+
+
+@pytest.mark.parametrize(("gravity", "word"), [(G, "non-minimum phase (hyperbolic)"), (-G, "marginal")])
+def test_what_depends_on_nothing_leaves_the_splitting_alone(gravity, word):
+    """A pole on a cart by the cart's speed; hanging it swings, on the imaginary axis."""
+    mechanism, program = cart_and_pole("speed")
+    hanging = sv.derive(mechanism, program).with_parameters(g=gravity)
+    assert verdict(hanging).word == word
+
+
+def test_an_angle_that_matters_in_motion_is_no_integral():
+    """A free link in the horizontal plane: at rest its angle is an eigenvalue 0, along the path its rates depend on it."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    tip = ca.vertcat(x + ca.cos(theta), ca.sin(theta))
+    mechanism = sv.Mechanism(q, sv.particle(q, 2.0, x) + sv.particle(q, 1.0, tip), actuators={"F": x})
+    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.5, smoothness=4)
+    found = verdict(sv.derive(mechanism, sv.Program({"X": x - path})))
+    assert found.word == "marginal" and "constant" not in found.reason
+
+
+# minima of second order ----------------------------------------------------------------------------------------------
+
+
+def over_a_hill(v, ranges, centre=0.5, **options):
+    """A point that moves along a line over a hill, or around it by a bow v."""
+    p, q = sv.parameters(v=v), sv.coordinates("x y")
+    x, y = q
+    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0, smoothness=4)
+    mechanism = sv.Mechanism(
+        q, sv.particle(q, 1.0, ca.vertcat(x, y)), potential=30 * ca.exp(-((x - centre) ** 2 + y**2) / 0.02),
+        actuators={"F": x, "G": y}, parameters=p,
+    )  # fmt: skip
+    model = sv.derive(mechanism, sv.Program({"X": x - s, "Y": y - p.v * 16 * s**2 * (1 - s) ** 2}))
+    return sv.design(model, {"v": ranges}, (0.0, 2.0), **options)
+
+
+def least_over_a_hill(ranges, centre=0.5, minimise="rms", **_):
+    """The least cost on a grid of v, from the path's own formula."""
+    t, v = np.linspace(0.0, 2.0, 2001), np.linspace(*ranges, 401)[:, None]
+    s = Polynomial([0.0] * 5 + [126.0, -420.0, 540.0, -315.0, 70.0])  # of class C^4
+    bow, (x, dx, ddx) = Polynomial([0.0, 0.0, 16.0, -32.0, 16.0]), (s.deriv(k)(t / 2) / 2**k for k in range(3))
+    y, ddy = v * bow(x), v * (bow.deriv(2)(x) * dx**2 + bow.deriv()(x) * ddx)
+    slope = 30.0 * np.exp(-((x - centre) ** 2 + y**2) / 0.02) / 0.01
+    forces = np.array([ddx - (x - centre) * slope, ddy - y * slope])
+    costs = np.abs(forces).max(axis=(0, 2)) if minimise == "peak" else np.sqrt(np.mean(forces**2, axis=2).sum(axis=0))
+    return costs.min()
+
+
+HILLS = {
+    "the issue's": ((0.0, (-1.0, 1.0)), {}), "on one side": ((0.0, (0.0, 1.0)), {}),
+    "another place": ((0.0, (-1.0, 1.0)), {"centre": 0.4}), "of a peak": ((0.0, (-1.0, 1.0)), {"minimise": "peak"}),
+    "within limits": ((0.0, (-1.0, 1.0)), {"limits": {"G": 400.0}}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HILLS)
+def test_a_design_leaves_a_stationary_point_for_less_cost(case):
+    given, options = HILLS[case]
+    found = over_a_hill(*given, **options)
+    assert found.cost == pytest.approx(least_over_a_hill(given[1], **options), rel=2e-3)
+    assert found.cost < found.before / 5
+    assert "a local minimum" in found.message and found.proof.passed
+
+
+@pytest.mark.parametrize("first", [0.7, 0.1, 0.1 + 1e-9])
+@pytest.mark.parametrize("minimise", ["rms", "peak"])
+def test_a_least_cost_of_zero_is_a_minimum(first, minimise):
+    p, q = sv.parameters(a=first), sv.coordinates("x")
+    (x,) = q
+    way = (p.a - 0.1) * sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0, smoothness=4)
+    model = sv.derive(sv.Mechanism(q, sv.particle(q, 1.0, x), actuators={"F": x}, parameters=p), sv.Program({"X": x - way}))
+    found = sv.design(model, {"a": (-1.0, 1.0)}, (0.0, 2.0), minimise)
+    assert "a local minimum" in found.message and found.values["a"] == pytest.approx(0.1, abs=1e-7)

@@ -50,10 +50,9 @@ def close(
         Rate [Hz] of a function, delay in samples, integration steps per sample.
     disturbance : dict of str to callable or float, optional
         Generalised forces by coordinate (or quasi-velocity), functions of time such as those of `sv.disturbances`.
-        Integration steps end where these are not smooth. Your own function tells where it is not by its attribute
-        `edges`, a sequence [s], and how long steps may be by `longest` [s]. A parameter of the mechanism that enters
-        forces only, such as the speed of the wind, is also named: its value is then this function, which the law does
-        not know.
+        Integration steps end at their edges; those of your own function are its attribute `edges`, a sequence [s], and
+        steps are at most its `longest` [s]. A parameter of the mechanism that enters forces only, such as the speed of
+        the wind, is also named: its value is then this function, which the law does not know.
     plan : Run, optional
         The reference trajectory for residuals and errors; default: that of the law.
 

@@ -161,10 +161,9 @@ class Conditions:
         object.__setattr__(self, "disturbance", dict(mapping(self.disturbance, "The disturbances")))
 
     def forces(self, t0, h, count, finer=1):
-        """The disturbances of a `Loop` in its integration steps, so many of length h [s] from t0 on.
+        """The disturbances of a `Loop` in so many steps of length h [s] from t0 on, which are cut at their `edges`.
 
-        Steps end at the `edges` of a disturbance, and are cut into equal ones that are at most its `longest`; these
-        parts are cut once more into so many (`finer`).
+        They are also cut into equal parts of at most their `longest`, and these once more into so many (`finer`).
         """
         functions = self.disturbance.values()
         if not functions and finer == 1:
@@ -173,20 +172,15 @@ class Conditions:
         n = max(1, int(np.ceil(h / longest - ON_SAMPLE)))
         require_memory(count * n * finer, 3 * len(functions) + 3, f"A disturbance needs steps of {h / n:.3g} s")
         edges = np.unique([e for f in functions for e in array_of("edges", getattr(f, "edges", ()), None).tolist()])
-        inside = max(WITHIN_STEP * h / n, 2 * np.spacing(abs(t0) + count * h))
-        apart = np.abs((edges - t0) * n / h - np.rint((edges - t0) * n / h)) * h / n
-        apart = np.minimum(apart, np.diff(edges, prepend=-np.inf))
-        edges = edges[(apart > inside) & (edges > t0) & (edges < t0 + count * h)]
-        step = np.append(np.arange(count * n) // n, ((edges - t0) // h).astype(np.int64))
-        begin = np.append(np.arange(count * n) % n * h / n, edges - t0 - step[count * n :] * h)
-        order = np.lexsort((begin, step))
-        step, begin = np.repeat(step[order], finer), begin[order]
-        length = (np.append(np.where(np.diff(step[::finer]) == 0, begin[1:], h), h) - begin)[:, None] / finer
-        begin, length = (begin[:, None] + np.arange(finer) * length).ravel(), np.repeat(length, finer)
+        at, inside = (edges - t0) * n / h, max(WITHIN_STEP, 2 * np.spacing(abs(t0) + count * h) * n / h)
+        at = at[(np.abs(at - np.rint(at)) > inside) & (np.diff(at, prepend=-np.inf) > inside)]
+        begin = np.sort(np.append(np.arange(count * n), at[(at > 0) & (at < count * n)]))  # in h/n
+        begin = (begin[:, None] + np.diff(begin, append=count * n)[:, None] * np.arange(finer) / finer).ravel()
+        step, length, inside = (begin // n).astype(np.int64), np.diff(begin, append=count * n) * h / n, inside * h / n
+        begin = (begin - n * step) * h / n
         t = (t0 + step * h + begin)[:, None] + np.stack([inside + 0 * length, length / 2, length - inside], axis=1)
-        values = [sampled(name, f, t) for name, f in self.disturbance.items()]
+        values = np.stack([sampled(name, f, t) for name, f in self.disturbance.items()], -1) if functions else None
         parts = np.searchsorted(step, np.arange(count + 1)) if len(step) > count else None
-        values = np.stack(values, axis=-1) if values else np.zeros((*t.shape, 0))
         return {"disturbance": values, "parts": parts, "spans": np.stack([begin, length], axis=1)}
 
 

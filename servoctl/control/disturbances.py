@@ -48,10 +48,8 @@ class Gust:
                 rise=self.rise,
             )
 
-    @property
-    def edges(self):
-        """Instants at which integration steps end [s]: those of both edges, and within them, at most a radian apart."""
-        return np.add.outer([self.start, self.end - self.rise], np.linspace(0, self.rise, 5)).ravel()
+    # at which integration steps end [s]: those of the rise and of the fall, at most a radian apart
+    edges = property(lambda s: np.add.outer([s.start, s.end - s.rise], np.linspace(0, s.rise, 5)).ravel())
 
     def __call__(self, t):
         """The force at times t [s]."""
@@ -81,7 +79,7 @@ class Step:
     def __post_init__(self):
         _as_floats(self)
 
-    edges = property(lambda self: (self.at,), doc="Instants at which integration steps end [s].")
+    edges = property(lambda self: (self.at,))  # at which integration steps end [s]
 
     def __call__(self, t):
         """The force at times t [s]."""
@@ -125,10 +123,8 @@ class Noise:
                 bandwidth=self.bandwidth,
             )
 
-    @property
-    def longest(self):
-        """The longest integration step [s]: one radian of the highest harmonic, where Simpson's rule errs by 1/2880."""
-        return 1 / (2 * np.pi * self.bandwidth)
+    # of an integration step [s]: one radian of the highest harmonic, where Simpson's rule errs by 1/2880
+    longest = property(lambda self: 1 / (2 * np.pi * self.bandwidth))
 
     def __call__(self, t):
         """The force at times t [s]."""

@@ -140,8 +140,7 @@ class _Machine:
                 do="Leave the lag out, or model it in MuJoCo.",
                 lag=list(plant.lag),
             )
-        model = copy(model)  # whose step varies
-        self.library, self.model, self.data, self.plant = library, model, library.MjData(model), plant
+        self.library, self.model, self.data, self.plant = library, copy(model), library.MjData(model), plant
         q = plant.mechanism.q
         self.free, self.places, self.speeds = [], np.zeros(q.nq, int), np.zeros(q.n, int)
         self._find(q)

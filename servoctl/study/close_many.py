@@ -305,14 +305,8 @@ def _one(run, loop, constants, start, factors, seed):
 
 
 def _scaled(f, factor):
-    if not callable(f):
-        return factor * f
-
-    def scaled(t):
-        return factor * f(t)
-
-    vars(scaled).update({name: getattr(f, name) for name in ("edges", "longest") if hasattr(f, name)})
-    return scaled
+    known = {name: getattr(f, name) for name in ("edges", "longest") if hasattr(f, name)}
+    return type("Scaled", (), {"__call__": lambda _, t: factor * f(t), **known})() if callable(f) else factor * f
 
 
 def _reasons(run, loop, numbers, seeds, gathered):

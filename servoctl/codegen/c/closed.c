@@ -76,7 +76,7 @@ int64_t FN(closed)(Step *law, Loop *c)
                 p[c->at_u + i] = sent < 0 ? c->initial_input[i] : c->input[sent / c->substeps * c->n_u + i];
             }
             for (int64_t i = first_part(c, step); i < first_part(c, step + 1); i++) {
-                const double begun = t + (double)s * h + begin_of(c, i), length = length_of(c, i, h);
+                const double begun = begin_of(c, k, s, i), length = length_of(c, i, h);
                 advance(c, begun, length, c->disturbance + 3 * i * c->n_d, x, p);
                 restore(begun + length, x, p);
             }

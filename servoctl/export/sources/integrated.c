@@ -23,7 +23,7 @@ static int advance(double t, double h, double *x, const double *p)
     for (int i = 0; i < NX; i++) y[i] = x[i] + h * k[2][i];
     rates(t + h, y, p, k[3]);
     for (int i = 0; i < NX; i++) y[i] = x[i] + h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
-    if (!all_finite(NX, y)) return -1;
+    for (int i = 0; i < NX; i++) if (!(y[i] - y[i] == 0)) return -1;
     for (int i = 0; i < NX; i++) x[i] = y[i];
     return 0;
 }
