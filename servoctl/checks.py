@@ -33,9 +33,8 @@ def column(value, what, size=None):
     """A list of SX scalars from a scalar, a sequence, or an SX column, of length `size` if that is given."""
     try:
         if isinstance(value, (list, tuple)):
-            value = ca.vertcat(*map(_not_truth, value)) if value else ca.SX(0, 1)
-        _not_truth(value)
-        flat = ca.densify(ca.vec(ca.SX(value)))
+            value = ca.vertcat(*map(_real, value)) if value else ca.SX(0, 1)
+        flat = ca.densify(ca.vec(ca.SX(_real(value))))
         items = flat.elements()
     except Exception as error:  # CasADi raises several types here, none of which helps the designer
         kind = type(value).__name__
@@ -59,19 +58,21 @@ def column(value, what, size=None):
     return items
 
 
-def _not_truth(value):
-    """The value; TypeError for True and False, which CasADi takes for numbers."""
-    if isinstance(value, (bool, np.bool_)):
-        raise TypeError("a truth value is no number")
-    return value
+def _real(value):
+    """The value, of NumPy in double precision; TypeError for truth values and complex numbers, which CasADi takes."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "O")
+    if isinstance(value, (bool, complex)) or kind in "bc":
+        raise TypeError("a truth value or a complex number is no number")
+    return value.astype(float) if kind == "f" else value
 
 
 def matrix(value, what):
     """An SX matrix from a number, an SX matrix, an array, or nested sequences of scalars."""
     try:
         if isinstance(value, (list, tuple)):
-            value = ca.vertcat(*(ca.horzcat(*row) if isinstance(row, (list, tuple)) else ca.SX(row) for row in value))
-        result = ca.SX(value)
+            rows = (map(_real, row) if isinstance(row, (list, tuple)) else [ca.SX(_real(row))] for row in value)
+            value = ca.vertcat(*(ca.horzcat(*row) for row in rows))
+        result = ca.SX(_real(value))
     except Exception as error:  # CasADi raises several types here
         rule, do = "It must be a matrix of numbers and expressions.", "Give rows of equal length."
         raise SpecificationError(f"{what} is {value!r}.", rule, do=do, what=what) from error
@@ -272,7 +273,7 @@ def plain(value):
 def finite(name, value, what="value"):
     """A finite float from a number; `what` it is, in the singular: "limit", "noise"."""
     try:
-        number = math.nan if isinstance(value, (str, bytes, complex, bool, np.bool_)) else float(value)
+        number = math.nan if isinstance(value, (str, bytes)) else float(_real(value))
     except Exception:  # CasADi raises its own types for symbols
         number = math.nan
     if not math.isfinite(number):

@@ -218,8 +218,8 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
     method, drift = _method_and_drift(model, method, drift, t0, t1)
-    leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, (Poles, Project))
-    x0 = (as_state if leads_back else consistent_state)(model, start, t0)
+    leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, Poles)
+    x0 = as_state(model, start, t0) if leads_back else consistent_state(model, start, t0, isinstance(drift, Project))
     knots = model.require_smooth((min(span), max(span)))
     if not isinstance(method, Algebraic):
         knots = tuple(sorted({*knots, *model.ends_of_pieces((min(span), max(span))).tolist()}))
@@ -577,16 +577,19 @@ def _scaled_residuals(model, t, x):
     return names, values, np.fmin(np.fmax(off, 0.0), np.finfo(float).max)
 
 
-def consistent_state(model, start, t):
-    """The state that a start gives, which must satisfy the invariants: nothing would lead the motion back to them."""
-    x = as_state(model, start, t)
+def consistent_state(model, start, t, project=False):
+    """The state that a start gives, or its projection, which must satisfy the invariants: nothing would lead back."""
+    x, before = as_state(model, start, t), np.inf
+    while project and (off := np.abs(_scaled_residuals(model, t, x)[2]).max(initial=0.0)) < before:
+        x, before = model.function("ode_projected").restore(t, x, model.parameters), off
     names, values, off = _scaled_residuals(model, t, x)
     if off.max(initial=0.0) > OFF:
         worst = int(np.argmax(off))
         raise InconsistentStart(
-            f"The start leaves the residual {values[worst]:.3g} of {names[worst]!r}.",
+            f"The start{' after projection' * project} leaves the residual {values[worst]:.3g} of {names[worst]!r}.",
             "It must satisfy every constraint at every level, or the whole motion violates them.",
-            do="Complete it by model.start(guess={...}), or use drift='project', which corrects it.",
+            do="Complete it by model.start(guess={...})"
+            + ("." if project else ", or use drift='project', which corrects it."),
             invariant=names[worst],
             residual=float(values[worst]),
         )

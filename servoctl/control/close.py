@@ -50,8 +50,9 @@ def close(
         Rate [Hz] of a function, delay in samples, integration steps per sample.
     disturbance : dict of str to callable or float, optional
         Generalised forces by coordinate (or quasi-velocity), functions of time such as those of `sv.disturbances`.
-        They should jump at the ends of integration steps only. A parameter of the mechanism that enters forces only,
-        such as the speed of the wind, is also named: its value is then this function, which the law does not know.
+        Integration steps end at their edges; those of your own function are its attribute `edges`, a sequence [s], and
+        steps are at most its `longest` [s]. A parameter of the mechanism that enters forces only, such as the speed of
+        the wind, is also named: its value is then this function, which the law does not know.
     plan : Run, optional
         The reference trajectory for residuals and errors; default: that of the law.
 
@@ -146,10 +147,10 @@ def loop_of(plant, law, x0, t_span, conditions):
         at_u=len(plant.parameters), t0=t0, period=law.period, p=plant.p(), x0=x0, z0=law.state, table=law.schedule.T,
         measured=np.array([plant.state_names.index(name) for name in law.measures], dtype=np.int64),
         disturbed=disturbed, initial_input=initial,
-        disturbance=conditions.forces(t0, law.period / substeps, samples * substeps),
         noise=sensors.noisy(law.measures, samples + 1) if sensors.noise else None,
         quantum=sensors.quantum(law.measures) if sensors.quantisation else None,
         low=low, high=high, change=change, transport=transport,
+        **conditions.forces(t0, law.period / substeps, samples * substeps),
     )  # fmt: skip
 
 

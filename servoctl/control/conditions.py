@@ -8,6 +8,7 @@ import numpy as np
 from servoctl.checks import (
     MOST_COUNT,
     ON_SAMPLE,
+    array_of,
     mapping,
     named,
     numbers_by_name,
@@ -159,13 +160,28 @@ class Conditions:
             object.__setattr__(self, name, value)
         object.__setattr__(self, "disturbance", dict(mapping(self.disturbance, "The disturbances")))
 
-    def forces(self, t0, h, count):
-        """Disturbances at the start, middle and end of each integration step, (count, 3, n_d); None without any."""
-        if not self.disturbance:
-            return None
-        starts = t0 + np.arange(count)[:, None] * h
-        t = starts + np.array([WITHIN_STEP, 0.5, 1 - WITHIN_STEP]) * h
-        return np.stack([sampled(name, f, t) for name, f in self.disturbance.items()], axis=-1)
+    def forces(self, t0, h, count, finer=1):
+        """The disturbances of a `Loop` in so many steps of length h [s] from t0 on, which are cut at their `edges`.
+
+        They are also cut into equal parts of at most their `longest`, and these once more into so many (`finer`).
+        """
+        functions = self.disturbance.values()
+        if not functions and finer == 1:
+            return dict.fromkeys(("disturbance", "parts", "spans"))
+        longest = min((positive("longest", getattr(f, "longest", h)) for f in functions), default=h)
+        n = max(1, int(np.ceil(h / longest - ON_SAMPLE)))
+        require_memory(count * n * finer, 3 * len(functions) + 3, f"A disturbance needs steps of {h / n:.3g} s")
+        edges = np.unique([e for f in functions for e in array_of("edges", getattr(f, "edges", ()), None).tolist()])
+        at, inside = (edges - t0) * n / h, max(WITHIN_STEP, 2 * np.spacing(abs(t0) + count * h) * n / h)
+        at = at[(np.abs(at - np.rint(at)) > inside) & (np.diff(at, prepend=-np.inf) > inside)]
+        begin = np.sort(np.append(np.arange(count * n), at[(at > 0) & (at < count * n)]))  # in h/n
+        begin = (begin[:, None] + np.diff(begin, append=count * n)[:, None] * np.arange(finer) / finer).ravel()
+        step, length, inside = (begin // n).astype(np.int64), np.diff(begin, append=count * n) * h / n, inside * h / n
+        begin = (begin - n * step) * h / n
+        t = (t0 + step * h + begin)[:, None] + np.stack([inside + 0 * length, length / 2, length - inside], axis=1)
+        values = np.stack([sampled(name, f, t) for name, f in self.disturbance.items()], -1) if functions else None
+        parts = np.searchsorted(step, np.arange(count + 1)) if len(step) > count else None
+        return {"disturbance": values, "parts": parts, "spans": np.stack([begin, length], axis=1)}
 
 
 def _by_measure(values, measures):

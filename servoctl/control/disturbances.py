@@ -48,6 +48,9 @@ class Gust:
                 rise=self.rise,
             )
 
+    # at which integration steps end [s]: those of the rise and of the fall, at most a radian apart
+    edges = property(lambda s: np.add.outer([s.start, s.end - s.rise], np.linspace(0, s.rise, 5)).ravel())
+
     def __call__(self, t):
         """The force at times t [s]."""
         t = np.asarray(t, dtype=float)
@@ -75,6 +78,8 @@ class Step:
 
     def __post_init__(self):
         _as_floats(self)
+
+    edges = property(lambda self: (self.at,))  # at which integration steps end [s]
 
     def __call__(self, t):
         """The force at times t [s]."""
@@ -117,6 +122,9 @@ class Noise:
                 std=self.std,
                 bandwidth=self.bandwidth,
             )
+
+    # of an integration step [s]: one radian of the highest harmonic, where Simpson's rule errs by 1/2880
+    longest = property(lambda self: 1 / (2 * np.pi * self.bandwidth))
 
     def __call__(self, t):
         """The force at times t [s]."""

@@ -37,7 +37,9 @@ class Loop(Value):
     measured: np.ndarray  # (n_y,) indices of states
     disturbed: np.ndarray  # (n_d,) indices in p of generalised forces and parameters
     initial_input: np.ndarray  # (n_u,) until the first command arrives
-    disturbance: np.ndarray = None  # (samples * substeps, 3, n_d) at the start, the middle and the end of each step
+    disturbance: np.ndarray = None  # (n_parts, 3, n_d) at the start, the middle and the end of each part of a step
+    parts: np.ndarray = None  # (samples * substeps + 1,) first part of each step; None: each has one, all of it
+    spans: np.ndarray = None  # (n_parts, 2) begin of a part after that of its step, and its length [s]
     noise: np.ndarray = None  # (samples + 1, n_y)
     quantum: np.ndarray = None  # (n_y,)
     low: np.ndarray = None  # (n_u,) limits of the inputs
@@ -50,13 +52,13 @@ _FIELDS = {
     ctypes.c_int64: "samples substeps delay n_y n_z n_u n_out n_row rows first n_d at_u depth every n_traced columns "
     "stop status sample step steps stride",
     ctypes.c_double: "t0 period",
-    ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance constants scale "
-    "deviations measured transport disturbed traced keys state x law_x law_y input gathered trace law",
+    ctypes.c_void_p: "p x0 z0 table noise quantum low high change initial_input disturbance spans constants "
+    "scale deviations measured transport disturbed traced parts keys state x law_x law_y input gathered trace law",
 }
 _TYPES = {np.float64, np.int64, np.uint64}  # of numbers in arrays
 _KIND_OF = {name: kind for kind, names in _FIELDS.items() for name in names.split()}
 _KIND_OF |= dict.fromkeys((n for n, kind in _KIND_OF.items() if kind is ctypes.c_void_p and n != "law"), np.float64)
-_KIND_OF |= dict.fromkeys(("measured", "transport", "disturbed", "traced"), np.int64) | {"keys": np.uint64}
+_KIND_OF |= dict.fromkeys(("measured", "transport", "disturbed", "traced", "parts"), np.int64) | {"keys": np.uint64}
 
 
 class Arguments(ctypes.Structure):
@@ -194,32 +196,36 @@ def samples_ago(step, transport, substeps):
     return -((step - transport) // substeps)
 
 
-def hold(ode, t, h, x, steps):
-    """The state x (n_x,) at the end of a sample that starts at t, by Runge-Kutta steps of order 4 and length h [s].
+def hold(ode, t, x, steps):
+    """The state x (n_x,) at the end of a sample that starts at t, by Runge-Kutta steps of order 4.
 
-    `steps` are the plant's numbers (n_p,), with inputs and disturbances, at the start, middle and end of each step.
+    `steps` are the begin of each after t and its length [s], and the plant's numbers (n_p,), with inputs and
+    disturbances, at its start, middle and end.
     """
     n = len(x)
-    for s, (start, middle, end) in enumerate(steps):
-        at = t + s * h
+    for begin, h, (start, middle, end) in steps:
+        at = t + begin
         k1 = ode(at, x, start)[:n]
         k2 = ode(at + h / 2, x + h / 2 * k1, middle)[:n]
         k3 = ode(at + h / 2, x + h / 2 * k2, middle)[:n]
         k4 = ode(at + h, x + h * k3, end)[:n]
-        x = ode.restore(t + (s + 1) * h, x + h / 6 * (k1 + 2 * (k2 + k3) + k4), end)
+        x = ode.restore(at + h, x + h / 6 * (k1 + 2 * (k2 + k3) + k4), end)
     return x
 
 
 def _steps(c, k, inputs):
-    """Parameters at the start, the middle and the end of each step of sample k."""
-    late = 0 if c.transport is None else c.transport
+    """Begin after the sample k and length of each step [s], parameters at its start, middle and end."""
+    late, h = 0 if c.transport is None else c.transport, c.period / c.substeps
     for s in range(c.substeps):
         stages = np.tile(c.p, (3, 1))
         applied = k - samples_ago(s, late, c.substeps) + np.zeros(c.n_u, dtype=int)
         stages[:, c.at_u : c.at_u + c.n_u] = np.where(applied < 0, c.initial_input, inputs[applied, range(c.n_u)])
-        if len(c.disturbed):
-            stages[:, c.disturbed] = c.disturbance[k * c.substeps + s]
-        yield stages
+        step = k * c.substeps + s
+        for part in (step,) if c.parts is None else range(*c.parts[step : step + 2]):
+            if len(c.disturbed):
+                stages[:, c.disturbed] = c.disturbance[part]
+            begin, length = (0.0, h) if c.parts is None else c.spans[part]
+            yield s * h + begin, length, stages
 
 
 @np.errstate(all="ignore")
@@ -246,7 +252,7 @@ def _interpreted(ode, law, c, advance, logs):
             break
         law_x[k + 1, n_y:] = law_y[k, n_u : n_u + n_z]
         try:
-            x = advance(ode, t, c.period / c.substeps, x, _steps(c, k, inputs))
+            x = advance(ode, t, x, _steps(c, k, inputs))
         except KeyboardInterrupt:
             return k + 1, INTERRUPTED
     return c.samples + 1, FINISHED

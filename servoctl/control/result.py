@@ -134,9 +134,10 @@ class Closed(Sampled, Value):
         loop = self.loop
         if loop.disturbance is None:
             return np.zeros((0, len(self.t)))
-        steps = np.minimum(np.arange(len(self.t)) * loop.substeps, len(loop.disturbance) - 1)
+        steps = np.arange(len(self.t)) * loop.substeps
+        parts = np.minimum(steps if loop.parts is None else loop.parts[steps], len(loop.disturbance) - 1)
         ends = np.where(np.arange(len(self.t)) < loop.samples, 0, 2)
-        return loop.disturbance[steps, ends].T
+        return loop.disturbance[parts, ends].T
 
     @property
     def measured(self) -> dict[str, np.ndarray]:

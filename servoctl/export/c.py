@@ -30,8 +30,7 @@ IN_FLOATS = {  # corrections that end it, at once and where they no longer fall;
 COUNTED = 16777216  # 2^24: whole numbers up to it are floats
 LARGEST_CONDITION = 1e5  # of the metric of an allocation in floats, which have seven digits
 TIME = Scalar("t")
-FINITE = "Returns 0, or -1 if a time is no finite number: nothing is then changed."
-ANSWERED = "Returns 0, or -1 if the time or a command is no finite number: nothing is then changed."
+FINITE = "Returns 0, or -1 if a time or an answer is no finite number: nothing is then changed."
 EXCLUDED = " There is no command where limits and bounds exclude each other."
 RESERVED = "auto break case char const continue default do double else enum extern float for goto if inline int long "
 RESERVED += "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile "
@@ -239,13 +238,13 @@ def _algebraic(model, x, z, p, u):
     about = (
         "Feedforward: jets z and u at time t [s], by Newton's method. The coordinates in x are its guess, and x "
         "becomes the state, the guess of the next instant. Returns the number of corrections, or -1 if the iteration "
-        "fails: z and u are then unchanged, and x must be set again."
+        "fails or an answer is no finite number: z and u are then unchanged, and x must be set again."
     )
     arguments = (TIME, x.output(), p.input(), z.output(), u.output())
     first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' in the outputs of `path`
     sizes = {"N": model.n, "NQ": model.nq, "NY": f.numel_out(0), "FIRST": first}
-    sizes |= {"ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE, "STALLED": 0.0}
-    return {"path": f}, [Routine("feedforward", about, arguments, "int")], ("newton.c",), sizes
+    sizes |= {"ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE, "STALLED": 0.0, "NJ": len(z.names), "NU": len(u.names)}
+    return {"path": f}, [Routine("feedforward", about, arguments, "int")], ("answer.c", "newton.c"), sizes
 
 
 def _integrated(model, x, z, p, u):
@@ -264,7 +263,8 @@ def _integrated(model, x, z, p, u):
         Routine("feedforward", about["feedforward"], (*at, z.output(), u.output()), "int"),
         Routine("advance", about["advance"], (TIME, Scalar("h"), x.output(), p.input()), "int"),
     ]
-    return {"rates": rates}, routines, ("integrated.c",), {"N": model.n, "NX": size}
+    sizes = {"N": model.n, "NX": size, "NJ": len(z.names), "NU": len(u.names)}
+    return {"rates": rates}, routines, ("answer.c", "integrated.c"), sizes
 
 
 def _thinning(law, thinned):
@@ -287,7 +287,7 @@ def _of_law(law, thinned):
     about = (
         "One sample of the law: command u of the measurement y and the controller state z, which becomes the next one. "
         f"Call it every {1 / law.rate:.9g} s from t = {law.t0:g} s; after the schedule its last row applies. "
-        f"{ANSWERED}{'' if allocation is None else EXCLUDED}"
+        f"{FINITE}{'' if allocation is None else EXCLUDED}"
     )
     routines = (
         Routine("start", "Sets the controller state z to its value at the start.", (z.output(),)),

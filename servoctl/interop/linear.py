@@ -234,7 +234,7 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
     if rate is not None:
         A, B = (part[0] for part in discretised(A[None], B[None], 1.0 / positive("rate", rate)))
     return control.ss(
-        A, B, C, D, dt=0 if rate is None else 1.0 / rate, name=name, states=plant.state_names,
+        A, B, C, D, dt=0 if rate is None else 1.0 / float(rate), name=name, states=plant.state_names,
         inputs=[*plant.inputs, *(f"disturbance {force}" for force in disturbed)], outputs=output_names(plant),
     )  # fmt: skip
 

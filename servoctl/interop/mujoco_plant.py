@@ -1,6 +1,7 @@
 """MuJoCo as an independent plant under a sampled law."""
 
 import math
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -139,7 +140,7 @@ class _Machine:
                 do="Leave the lag out, or model it in MuJoCo.",
                 lag=list(plant.lag),
             )
-        self.library, self.model, self.data, self.plant = library, model, library.MjData(model), plant
+        self.library, self.model, self.data, self.plant = library, copy(model), library.MjData(model), plant
         q = plant.mechanism.q
         self.free, self.places, self.speeds = [], np.zeros(q.nq, int), np.zeros(q.n, int)
         self._find(q)
@@ -183,13 +184,13 @@ class _Machine:
             )
         return count
 
-    def hold(self, _ode, t, h, x, steps):
+    def hold(self, _ode, t, x, steps):
         """The state after a sample: MuJoCo's steps under the plant's inputs and disturbances."""
         data, nq = self.data, self.plant.mechanism.q.nq
         data.time, data.qpos[self.places], data.qvel[self.speeds] = t, x[:nq], x[nq:]
         for at_q, at_v in self.free:
             data.qvel[at_v : at_v + 3] = self._turn(at_q) @ data.qvel[at_v : at_v + 3]
-        for start, _middle, _end in steps:
+        for _begin, self.model.opt.timestep, (start, _middle, _end) in steps:
             forces = start[self._inputs]
             u, d = forces[: len(self.plant.inputs)], forces[len(self.plant.inputs) :]
             state = np.concatenate([data.qpos[self.places], x[nq:]])

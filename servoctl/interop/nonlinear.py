@@ -210,8 +210,8 @@ class _SampledPlant:
         applied = limited(commands[self.delay], before, self.low, self.high, self.change)
         inputs = np.vstack([applied[None], inputs])
         ages = (samples_ago(s, self.late, self.substeps) for s in range(self.substeps))
-        stages = (3 * (numbers(inputs[age, range(m)]),) for age in ages)
-        x = hold(self.plant.function("ode"), t, self.h, x, stages)
+        held = ((s * self.h, self.h, 3 * (numbers(inputs[age, range(m)]),)) for s, age in enumerate(ages))
+        x = hold(self.plant.function("ode"), t, x, held)
         return np.concatenate([x, commands[: self.delay].ravel(), inputs[: self.past].ravel()])
 
 

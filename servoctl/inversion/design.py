@@ -45,7 +45,8 @@ SMALLEST_REGION = 1e-6  # of the ranges: region without a motion next to one wit
 QUADRATIC_PROGRAMS = 200  # of sequential quadratic programming in one region
 UNCHANGED = 1e-12  # change of the cost, relative to that before, with which sequential quadratic programming ends
 ACTIVE = 1e-5  # distance from an inequality, relative to the limit, within which it counts as met
-STATIONARY = 1e-4  # of the cost: largest first-order gain across the ranges at a local minimum
+STATIONARY = 1e-4  # of the cost: largest gain across the ranges at a local minimum
+PROBED = (0.1, 0.3)  # of the ranges: how far from a minimum less cost is looked for
 
 
 @frozen(eq=False)
@@ -67,8 +68,8 @@ class Design(Shown):
     binding : tuple of (str, str)
         What bounds the minimum: signals at a limit, parameters at an end of their range; "lower" or "upper" each.
     gain : float
-        How much of the cost a change of the parameters across their ranges would save, to first order, within the
-        limits: zero at a local minimum.
+        How much of the cost a change of the parameters across their ranges would save, to first and second order,
+        within the limits: zero at a local minimum, and where the cost itself is.
     motions : int
         How many were computed.
     """
@@ -93,7 +94,7 @@ class Design(Shown):
         """Whether this is a local minimum, and if not, what to do."""
         if self.gain <= STATIONARY:
             return f"a local minimum: the gradient left is {self.gain:.1e} of the cost"
-        return f"inconclusive: the gradient left is {self.gain:.1e} of the cost; begin elsewhere, or smooth kinks"
+        return f"inconclusive: {self.gain:.1e} of the cost is left to save; begin elsewhere, or smooth kinks"
 
     def __repr__(self):
         shown = [f"{name} = {value:.6g}" for name, value in self.values.items()]
@@ -416,7 +417,7 @@ class Search:
 
     def clear(self):
         """Forget motions that were evaluated at other nodes."""
-        self._known = functools.lru_cache(maxsize=8)(lambda data: self._local(np.frombuffer(data)))
+        self._known = functools.lru_cache(maxsize=64)(lambda data: self._local(np.frombuffer(data)))
 
     def parameters(self, v):
         """The parameters (k,) of unknowns (k,)."""
@@ -500,7 +501,10 @@ class Search:
             times = self.exceeding(v, plan)
             doubled = self.minimise == "rms" and self.refined(v)
             if not times and not doubled:
-                return self.designed(v, before, plan)
+                less = self.gain(v)[1]
+                if less is None:
+                    return self.designed(v, before, plan)
+                v = less
             if times:
                 self.nodes = self.nodes.joined(motions.t0, motions.ends(self.parameters(v))[0], times)
             self.clear()
@@ -523,7 +527,7 @@ class Search:
                    if min(x, 1.0 - x) <= ACTIVE]  # fmt: skip
         return Design(
             values, self.minimise, self.measured(v, plan), before, plan, verify(plan.model, plan),
-            (*limits, *at_ends), self.gain(v), self.evaluated,
+            (*limits, *at_ends), float(self.gain(v)[0]), self.evaluated,
         )  # fmt: skip
 
     def measured(self, v, plan):
@@ -583,19 +587,38 @@ class Search:
         return v
 
     def gain(self, v):
-        """The norm of what the gradient of the cost is not balanced by active inequalities, relative to the cost."""
+        """How much of the cost is left to save within the limits, and unknowns (k,) of less cost, None without any."""
+        from scipy.linalg import null_space
         from scipy.optimize import nnls
 
-        problem = NonlinearProgram(self, self.minimise, v)
+        problem, k = NonlinearProgram(self, self.minimise, v), len(v)
         x = problem.start(v)
-        gradient, k = problem.cost(x)[1], len(v)
-        sides = [np.eye(k)[v <= ACTIVE], -np.eye(k)[v >= 1.0 - ACTIVE]]
-        active = [np.pad(side, ((0, 0), (0, len(x) - k))) for side in sides]
-        if problem.constraints:
-            (c,) = problem.constraints
-            active.append(c["jac"](x)[c["fun"](x) <= ACTIVE])
-        active = np.vstack(active)
-        return float(nnls(active.T, gradient)[1] if len(active) else np.linalg.norm(gradient))
+        ends = np.pad(np.vstack([np.eye(k)[v <= ACTIVE], -np.eye(k)[v >= 1.0 - ACTIVE]]), ((0, 0), (0, len(x) - k)))
+        met = problem.inequalities(x) <= ACTIVE
+
+        def slopes(x):
+            return problem.cost(x)[1], np.vstack([ends, problem.slopes(x)[met]])
+
+        def allowed(v):
+            try:
+                return self.cost(v) if self.within(v)[0].min(initial=0.0) >= -SAFELY_INSIDE else np.inf
+            except NoMotion:
+                return np.inf
+
+        gradient, active = slopes(x)
+        balance, first = nnls(active.T, gradient) if len(active) else (np.zeros(0), np.linalg.norm(gradient))
+        along = null_space(np.vstack([active[balance > 0], 0 * x])).T
+        try:
+            bent = [g - gradient - (rows - active).T @ balance for g, rows in (slopes(x + ACTIVE * d) for d in along)]
+            rises = max((self.cost(v + ACTIVE * d[:k]) for d in along), default=0.0) - self.cost(v)
+        except NoMotion:
+            return float(first), None
+        curvature, directions = np.linalg.eigh(np.reshape(bent, along.shape) @ along.T / ACTIVE)
+        steps = np.outer(PROBED, (directions.T @ along)[:, :k]).reshape(-1, k)
+        less = min(np.clip([v, *v + steps, *v - steps], 0.0, 1.0), key=allowed)
+        less = less if allowed(less) < (1 - STATIONARY) * self.cost(v) else None
+        zero = self.cost(v) * ACTIVE < STATIONARY * rises  # beside what the ranges make of it
+        return 0.0 if zero else max(float(first), -curvature.min(initial=0.0) / 2), less
 
     def beyond(self, plan):
         """The error of a motion that exceeds a limit."""

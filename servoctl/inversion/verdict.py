@@ -6,7 +6,6 @@ equation does. Where the leading matrix loses its rank at rest, the zeros at inf
 
 from dataclasses import field
 
-import casadi as ca
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
@@ -25,7 +24,6 @@ HYPERBOLIC_ZEROS, GROWS = "non-minimum phase (hyperbolic)", "non-minimum phase"
 UNDETERMINED, UNREALISABLE, OPEN = "undetermined", "not realisable", "inconclusive"
 LOOKS = 5  # instants before and after a path at which the program must stand still for its end to be a rest
 ASIDE = 0.25  # of the path's length: how far from it they lie
-AT_ZERO = 1e-6  # of the fastest eigenvalue: a smaller one is zero, which rounding splits where it is double
 NEAR = 0.1  # of the sizes of the free entries: distance within which a run begins or ends in an unstable rest
 
 
@@ -66,7 +64,7 @@ class Verdict:
     @property
     def swings(self):
         """Whether a rest has eigenvalues on the imaginary axis."""
-        return any(len(end.on_axis) for end in self.rest.values())
+        return any(len(end.modes.on_axis) for end in self.rest.values())
 
     @property
     def growth(self):
@@ -136,7 +134,7 @@ def _of_motion(model, motion):
         return _on_switch(model, motion, f"the rest lies on a switch, {switch}, and has no linearisation")
     internal = internal_dynamics(model, motion) if isinstance(motion, Run) else None
     lost = "" if rest or internal else _lost_at_default_start(model, states[0][0])
-    return Verdict(SINGULAR, lost) if lost else _judged(rest, internal, why, _constants(model, rest))
+    return Verdict(SINGULAR, lost) if lost else _judged(rest, internal, why)
 
 
 def _lost_at_default_start(model, t):
@@ -234,31 +232,7 @@ def _reach(end, length):
     return ASIDE * abs(length) or (1 / fastest if fastest else 1.0)
 
 
-def _constants(model, rest):
-    """Constraints on velocities at a rest whose constants are eigenvalues 0, by name.
-
-    Where a(q)·γ' = b is linearised at a rest, a·V⁺δq is constant: an eigenvalue 0 for each independent row a.
-    """
-    r, q = model.reduction, model.reduction.mechanism.q
-    rows = {**r.mechanism.constraints, **r.program.residuals}
-    rows = {name: e for name, e in rows.items() if q.order(e) == 1}
-    if not (rows and rest):
-        return ()
-    end = next(iter(rest.values()))
-    slopes = ca.jacobian(ca.vertcat(*rows.values()), ca.vertcat(*q.gamma(1)))
-    state = ca.vertcat(*q, *q.gamma(1))
-    p = ca.vertcat(*r.mechanism.parameters.symbols)
-    f = ca.Function("slopes", [q.t, state, p], [ca.densify(slopes), ca.densify(q.V)])
-    slopes, V = map(np.array, f(end.t, end.x[: q.nq + q.n], model.parameters))
-    a = slopes @ np.linalg.pinv(V)
-    entries = FreeEntries(model, end.t, end.x)
-    tangent = entries.local(np.array([end.t]), end.x[:, None])[3][0][: q.nq]
-    zero = np.abs(end.eigenvalues) <= AT_ZERO * np.abs(end.eigenvalues).max(initial=1.0)
-    rank = np.linalg.matrix_rank(a @ tangent, AT_ZERO * max(1.0, np.abs(a).max()))
-    return tuple(rows) if rank and rank == zero.sum() else ()
-
-
-def _judged(rest, internal, why, constants=()):
+def _judged(rest, internal, why):
     """The verdict from eigenvalues at rest and the growth along a run."""
     facts, grows = {"rest": rest, "internal": internal}, internal is not None and internal.verdict == "unstable"
     if not rest:
@@ -266,14 +240,11 @@ def _judged(rest, internal, why, constants=()):
     said = {name: eigenvalues(end) for name, end in rest.items()}
     same = len(said) == 2 and len({*said.values()}) == 1
     reason = f"at both ends {said['start']}" if same else "; ".join(f"at the {name} {of}" for name, of in said.items())
-    if any(len(end.on_axis) for end in rest.values()):
-        do = ""
-        if constants:
-            reason += f"; 0 is the constant of {', '.join(constants)}"
-            do = f"{' and '.join(constants)} determine velocities: if they have integrals, write these on coordinates"
-        grows = grows or any(end.unstable_beyond_axis for end in rest.values())
-        return Verdict(GROWS if grows else MARGINAL, reason, do, **facts)
-    counts = {end.unstable for end in rest.values()}
+    constants, counts = next(iter(rest.values())).constants, {end.modes.unstable for end in rest.values()}
+    reason += f"; 0 is the constant of {', '.join(constants)}, on which nothing depends" * bool(constants)
+    if any(len(end.modes.on_axis) for end in rest.values()) or constants and counts == {0}:
+        grows = grows or any(end.modes.unstable_beyond_axis for end in rest.values())
+        return Verdict(GROWS if grows else MARGINAL, reason, **facts)
     if counts == {0}:
         return Verdict(GROWS if grows else MINIMUM, reason, **facts)
     return Verdict(HYPERBOLIC_ZEROS if len(counts) == 1 else GROWS, reason, **facts)

@@ -42,6 +42,7 @@ AIM = 0.1  # defect that refinement aims at, relative to the tolerance
 HYPERBOLIC = 1e-10  # distance to a matrix with an eigenvalue on the imaginary axis, relative to A, that is rounding
 STANDS = 1e-6  # relative change of the equilibrium before or after the span: the program does not stand still
 REGULAR = 1e-6  # smallest singular value of the free entries' part of the tangent space
+SPREAD = 0.1  # of the sizes of the state: how far seeds lie about a rest at which is asked what rates depend on
 BETWEEN = (0.15, 0.5, 0.9)  # places within an interval where the defect is measured
 
 
@@ -151,12 +152,26 @@ def _to_event(problem, events, solution, times):
 
 @frozen
 class End:
-    """An equilibrium: instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,)."""
+    """An equilibrium: instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,).
+
+    `others` (f, r) is an orthonormal basis of the entries over their sizes without integrals, on which nothing depends:
+    those have the names `constants`.
+    """
 
     t: float
     x: np.ndarray
     A: np.ndarray
     size: np.ndarray
+    others: np.ndarray | None = None
+    constants: tuple = ()
+
+    @cached_property
+    def modes(self):
+        """The rest without its integrals, whose constants are eigenvalues 0; all of it if there is nothing else."""
+        if self.others is None or not 0 < self.others.shape[1] < len(self.A):
+            return self
+        A = self.others.T @ (self.A * self.size / self.size[:, None]) @ self.others
+        return End(self.t, self.x, A, np.ones(len(A)))
 
     @cached_property
     def eigenvalues(self):
@@ -210,9 +225,14 @@ class End:
         return float(np.abs(self.eigenvalues[self.eigenvalues.real > 0]).max(initial=0.0))
 
     def left_space(self, unstable):
-        """An orthonormal basis (k, f) of the left eigenspace of the unstable, or of the stable eigenvalues."""
-        from scipy.linalg import schur
+        """A basis (k, f) of the left eigenspace of the unstable, or of the stable eigenvalues and of integrals."""
+        from scipy.linalg import null_space, schur, solve_sylvester
 
+        if self.modes is not self:
+            V, Q, A = null_space(self.others.T), self.others, self.A * self.size / self.size[:, None]
+            Y = solve_sylvester(V.T @ A @ V, -self.modes.A, V.T @ A @ Q)  # (Vᵀ + Y Qᵀ) A = (Vᵀ A V) (Vᵀ + Y Qᵀ)
+            rows = [self.modes.left_space(unstable) @ Q.T, *([] if unstable else [V.T + Y @ Q.T])]
+            return np.vstack(rows) / self.size
         split, sign = np.abs(self.on_axis.real).max(initial=0.0), 1 if unstable else -1  # as rounding splits them
         _, vectors, count = schur(self.A.T, output="real", sort=lambda re, im: sign * re > split)
         return vectors[:, :count].T
@@ -234,7 +254,8 @@ class FreeEntries:
         self.model, self.p = model, model.parameters
         self._equations = model.once("bounded", lambda: _equations(model))
         self.n_x, self.m = len(model.state_names), len(model.invariant_names())
-        self.size = np.maximum(np.abs(guess), 1.0)
+        self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *model.knots)
+        self.times = np.linspace(min(ends), max(ends), len(ends) + 9)  # at which is asked what rates depend on
         self._choose(np.array([t]), np.asarray(guess, dtype=float)[:, None], self.n_x - self.m)
 
     # the internal dynamics
@@ -303,7 +324,23 @@ class FreeEntries:
         # where z are no coordinates, z' = 0 for motions that do not stand still
         if not (still and np.abs(tangent[0] * size / self.size[:, None]).max(initial=0.0) < 1 / REGULAR):
             raise self._failure("Newton's method finds no equilibrium of the internal dynamics.", t[0])
-        return End(t[0], x[:, 0], A[0], size)
+        others = self._others(x)
+        constants = self.free[(others**2).sum(axis=1) < 1 - CUTOFF]
+        return End(t[0], x[:, 0], A[0], size, others, tuple(self.model.state_names[i] for i in constants))
+
+    def _others(self, rest):
+        """An orthonormal basis (f, r) of z in its sizes without integrals: rates depend on none, or theirs alone."""
+        x = rest + SPREAD * self.size[:, None] * np.random.default_rng(0).normal(size=(self.n_x, len(self.times)))
+        for _ in range(2 * LIFTED):
+            x = x + self.local(self.times, x)[2].T
+        A, size = self.local(self.times, x)[1], self.size[self.free]
+        A, Q = (A * size / size[:, None])[np.isfinite(A).all(axis=(1, 2))], np.eye(len(size))
+        while len(A) and Q.shape[1]:
+            _, s, directions = np.linalg.svd((Q.T @ A @ Q).reshape(-1, Q.shape[1]), full_matrices=False)
+            if s[-1] > CUTOFF * s[0]:
+                break
+            Q = Q @ directions[s > CUTOFF * s[0]].T
+        return Q
 
     def _scaled(self, A):
         """Magnitudes of the entries of matrices A (..., f, f) for z in its sizes."""
@@ -337,7 +374,8 @@ class Problem(FreeEntries):
         first = self.equilibrium(span[0], guess)
         last = self.equilibrium(span[1], first.x)
         times = np.linspace(*span, 41)
-        along = self._quasi_static(times, first.x[:, None] + np.linspace(0, 1, 41) * (last.x - first.x)[:, None])
+        along = first.x[:, None] + np.linspace(0, 1, 41) * (last.x - first.x)[:, None]
+        along = self._quasi_static(times, along, continuum=first.modes is not first)
         self.size = component_sizes(along, state_levels(model), 1.0)
         self._choose(times, along, self.n_x - self.m)
         self.first, self.last = (self.equilibrium(end.t, end.x) for end in (first, last))
@@ -346,7 +384,7 @@ class Problem(FreeEntries):
     def _require_splitting(self):
         """Refuse eigenvalues on the imaginary axis, and ends with different numbers of unstable ones."""
         for end, where in ((self.first, "begin"), (self.last, "end")):
-            for value in end.on_axis[:1]:
+            for value in end.modes.on_axis[:1]:
                 value = value if value.imag else value.real
                 raise UnstableInternalDynamics(
                     f"The internal dynamics have the eigenvalue {value:.4g} 1/s at the {where} of the program.",
@@ -355,7 +393,7 @@ class Problem(FreeEntries):
                     t=end.t,
                     eigenvalues=end.eigenvalues.tolist(),
                 )
-        unstable = [end.unstable for end in (self.first, self.last)]
+        unstable = [end.modes.unstable for end in (self.first, self.last)]
         if unstable[0] != unstable[1]:
             raise UnstableInternalDynamics(
                 f"The internal dynamics have {unstable[0]} unstable modes at the start, {unstable[1]} at the end.",
@@ -366,7 +404,7 @@ class Problem(FreeEntries):
 
     def window(self, length):
         """Begin and end [s] of a window that exceeds the span by `length` time constants, rounded up to two digits."""
-        (t0, t1), before, after = self.span, self.first.eigenvalues.real, self.last.eigenvalues.real
+        (t0, t1), before, after = self.span, self.first.modes.eigenvalues.real, self.last.modes.eigenvalues.real
         begin = t0 - _two_digits(length / before[before > 0].min(initial=np.inf))
         end = t1 + _two_digits(length / -after[after < 0].max(initial=-np.inf))
         for end_state, t in ((self.first, begin), (self.last, end)):
@@ -420,7 +458,7 @@ class Problem(FreeEntries):
         nodes = self._nodes(mesh)
         part = np.clip((nodes - self.span[0]) / (self.span[1] - self.span[0]), 0.0, 1.0)
         straight = self.first.x[:, None] + (self.last.x - self.first.x)[:, None] * part
-        x = self._quasi_static(nodes, straight)
+        x = self._quasi_static(nodes, straight, continuum=self.first.modes is not self.first)
         return np.where(np.isfinite(x).all(axis=0), x, straight)
 
     def _first_mesh(self, window, knots):
@@ -559,7 +597,7 @@ class Problem(FreeEntries):
         theta = (t - mesh[k]) / (mesh[k + 1] - mesh[k])
         values = self._polynomial(x, k, basis(self.c, theta))
         values = self._on_invariants(t, values)
-        values[:, t < mesh[0]], values[:, t > mesh[-1]] = self.first.x[:, None], self.last.x[:, None]
+        values[:, t < mesh[0]], values[:, t > mesh[-1]] = self.first.x[:, None], x[:, -1:]
         return values
 
     def _polynomial(self, x, k, weights):

@@ -133,12 +133,12 @@ def _conjugate_poles(row, poles):
 
 @frozen
 class Project:
-    """Projection onto the invariants: the least change of the jets in the metric M, after every `every`-th step.
+    """Projection onto the invariants: the least change of the jets in the metric M, of the start and after steps.
 
     Parameters
     ----------
     every : int
-        Steps between projections, at least 1.
+        Steps between projections, at least 1: after every `every`-th.
     """
 
     every: int = 1

@@ -31,7 +31,7 @@ class Rests:
         q = mechanism.q
         rows = {name: e for name, e in (rows | mechanism.followers).items() if q.order(e) <= 0}
         self.coordinates, self.nq, self.n = q.names, q.nq, q.n
-        self.zero = {name: 0.0 for name in q.names} | q.identity
+        self.zero = {name: q.identity.get(name, 0.0) for name in q.names}
         self.names = (*(f"balance of {name}" for name in q.force_names), *rows)
         mu, p, self.angles = ca.SX.sym("mu", B.shape[1]), ca.vertcat(*mechanism.parameters.symbols), None
         z = ca.vertcat(q.jet(0), mu)

@@ -14,6 +14,7 @@ from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded
 from servoctl.methods.radau import basis
 from servoctl.sensitivities.tangent import invariants_by, parameter_symbols, start_of
+from servoctl.tolerances import CUTOFF
 
 SAME_MOTION = 1e-3  # of its size: a run that differs by more is not the bounded motion of its program
 
@@ -36,7 +37,7 @@ def bounded_tangent(model, run, names):
     problem, mesh, x = _recomputed(model, run)
     at_nodes = _Linear(problem, names, problem._nodes(mesh), x)
     h, s = np.diff(mesh), len(problem.c)
-    rest = [-np.linalg.solve(at_nodes.A[i], at_nodes.b[i]) for i in (0, -1)]
+    rest = [-np.linalg.pinv(at_nodes.A[i], CUTOFF) @ at_nodes.b[i] for i in (0, -1)]
     dz = problem.linear(h, at_nodes.A, np.repeat(h, s)[:, None, None] * at_nodes.b[1:], rest)
     k = np.clip(np.searchsorted(mesh, run.t, side="right") - 1, 0, len(mesh) - 2)
     weights = basis(problem.c, (run.t - mesh[k]) / (mesh[k + 1] - mesh[k]))

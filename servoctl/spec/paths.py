@@ -18,7 +18,7 @@ import math
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_numbers, column, is_number, is_whole, named
+from servoctl.checks import as_list, as_numbers, column, is_number, is_whole, named
 from servoctl.errors import SpecificationError
 from servoctl.jets.lookup import columns_at
 
@@ -582,7 +582,7 @@ def _smoothness(k, least=0, most=SMOOTHEST):
 
 def _orthonormal(axes, centre):
     """Two orthonormal vectors of the size of `centre`."""
-    if not isinstance(axes, (list, tuple, np.ndarray)) or len(axes) != 2:
+    if not isinstance(axes, (list, tuple, np.ndarray)) or len(as_list(axes) or ()) != 2:
         raise SpecificationError(
             f"The circle's axes are {axes!r}.", "A pair of orthonormal vectors spans its plane.", axes=axes
         )

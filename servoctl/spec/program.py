@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, mapping, require_kind
+from servoctl.checks import column, finite, mapping, require_kind
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.branches import as_text, without_turns
 from servoctl.jets.overflow import settled
@@ -231,7 +231,6 @@ def _wish(name, value):
 def _as_float(value):
     """A finite number, or NaN for anything else."""
     try:
-        number = np.nan if isinstance(value, (str, bytes, bool, np.bool_)) else float(value)
-    except Exception:  # CasADi raises its own types for symbols
-        number = np.nan
-    return number if np.isfinite(number) else np.nan
+        return finite("value", value)
+    except SpecificationError:
+        return np.nan

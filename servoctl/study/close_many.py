@@ -160,7 +160,7 @@ def _resolved(run, constants, starts):
         return loop
     transport = steps(plant, law.period, substeps, loop.t0, loop.x0, loop.initial_input)[1]
     forces = run.conditions.forces(loop.t0, law.period / substeps, loop.samples * substeps)
-    return replace(loop, substeps=substeps, transport=transport, disturbance=forces)
+    return replace(loop, substeps=substeps, transport=transport, **forces)
 
 
 def _unit(run):
@@ -305,7 +305,8 @@ def _one(run, loop, constants, start, factors, seed):
 
 
 def _scaled(f, factor):
-    return (lambda t: factor * f(t)) if callable(f) else factor * f
+    known = {name: getattr(f, name) for name in ("edges", "longest") if hasattr(f, name)}
+    return type("Scaled", (), {"__call__": lambda _, t: factor * f(t), **known})() if callable(f) else factor * f
 
 
 def _reasons(run, loop, numbers, seeds, gathered):

@@ -75,16 +75,8 @@ def _require_signals(closed):
 def _again(closed, finer=1):
     """The loop of the law under its conditions, with steps shorter by a whole factor."""
     loop, law = closed.loop, closed.law
-    substeps = loop.substeps * finer
-    return replace(
-        loop,
-        samples=len(closed.t) - 1,
-        substeps=substeps,
-        z0=law.state,
-        table=law.schedule.T,
-        disturbance=closed.conditions.forces(loop.t0, loop.period / substeps, loop.samples * substeps),
-        transport=None if loop.transport is None else loop.transport * finer,
-    )
+    forces = closed.conditions.forces(loop.t0, loop.period / loop.substeps, loop.samples * loop.substeps, finer)
+    return replace(loop, samples=len(closed.t) - 1, z0=law.state, table=law.schedule.T, **forces)
 
 
 def _repeated(closed):

@@ -31,6 +31,7 @@ ODD = {
     "None": None, "text": "abc", "no text": "", "a number in text": "1.0", "NUL": "a\0b", "a surrogate": "\ud800",
     "bytes": b"x", "[]": [], "()": (), "{}": {}, "0": 0, "-1": -1, "1.5": 1.5, "2**63": 2**63, "10**400": 10**400,
     "1e-300": 1e-300, "1e300": 1e300, "NaN": math.nan, "inf": math.inf, "1j": 1j, "True": True,
+    "complex64": np.complex64(2 + 3j), "longdouble": np.longdouble(0.1),
     "(2, 3) array": np.ones((2, 3)), "array of NaN": np.array([np.nan]), "array of text": np.array(["a"]),
     "complex array": np.array([1j, 2.0]), "uneven": [[1, 2], [3]], "[None]": [None], "['a']": ["a"], "{1}": {1},
     "MX": ca.MX.sym("x"), "SX": ca.SX.sym("zz"), "SX of NaN": ca.SX(math.nan), "DM": ca.DM([1, 2]),

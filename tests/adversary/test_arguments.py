@@ -27,5 +27,5 @@ def test_texts_truth_values_and_symbols_are_no_numbers(outcomes):
     }  # fmt: skip
     for name, arguments in of_numbers.items():
         for argument in arguments:
-            for odd in ("a number in text", "True", "bytes", "array of text", "1j", "complex array", "NaN", "function"):
+            for odd in "a number in text/True/bytes/array of text/1j/complex64/complex array/NaN/function".split("/"):
                 assert outcomes[name, argument, odd] == "refused", (name, argument, odd)

@@ -172,21 +172,20 @@ INLINE void rates_at(double t, const double *d, Cases *s, W x[][NX + NV + 1], W 
 #define AT(v) v[g][i]
 #define RATES(stage, instant, state, k) rates_at(instant, d + stage * ND, s, state, k)
 
-/* Step i of sample k begins: its inputs, and the rates k1. After a sample it shares with it what depends on x alone. */
-INLINE void start(const Loop *c, int64_t k, int64_t i, Cases *s, W x[][NX + NV + 1], W k1[][NX + 1])
+/* A part of step i of sample k begins: its inputs, and the rates k1. After a sample it shares with it what depends on x alone. */
+INLINE void start(const Loop *c, int64_t k, int64_t i, int64_t part, Cases *s, W x[][NX + NV + 1], W k1[][NX + 1])
 {
-    const int64_t step = k * c->substeps + i;
-    const double *d = c->disturbance + 3 * step * ND;
-    if (c->transport) EACH_VECTOR(g) transported(c, step, s + g);
-    RATES(0, c->t0 + (double)k * c->period + (double)i * (c->period / (double)c->substeps), x, k1);
+    const double *d = c->disturbance + 3 * part * ND;
+    if (c->transport) EACH_VECTOR(g) transported(c, k * c->substeps + i, s + g);
+    RATES(0, begin_of(c, k, i, part), x, k1);
 }
 
-/* Step i of sample k of a block, with the rates k1 at its start. */
-INLINE void advance(const Loop *c, int64_t k, int64_t i, Cases *s, W x[][NX + NV + 1], W k1[][NX + 1])
+/* It, of a block, with the rates k1 at its start. */
+INLINE void advance(const Loop *c, int64_t k, int64_t i, int64_t part, Cases *s, W x[][NX + NV + 1], W k1[][NX + 1])
 {
     W k2[VECTORS][NX + 1], k3[VECTORS][NX + 1], k4[VECTORS][NX + 1], z[VECTORS][NX + NV + 1];
-    const double h = c->period / (double)c->substeps, t = c->t0 + (double)k * c->period + (double)i * h;
-    const double *d = c->disturbance + 3 * (k * c->substeps + i) * ND;
+    const double h = length_of(c, part, c->period / (double)c->substeps), t = begin_of(c, k, i, part);
+    const double *d = c->disturbance + 3 * part * ND;
 #include "rk4.h"
 #ifdef PROJECTED
     EACH_VECTOR(g) project(ALL(t + h), x[g], s[g].constants);
@@ -220,12 +219,14 @@ static int block(const Loop *c, int64_t at, double *scratch, int dated)
             EACH_VECTOR(g) if (w_any((s[g].lost + lost(NX, x[g])) != 0)) return 1;
         }
         if (k == c->samples) break;
-        start(c, k, 0, s, x, k1);
+        int64_t part = first_part(c, k * c->substeps);
+        start(c, k, 0, part, s, x, k1);
         for (int64_t i = 0; ; ) {
             if (*(const volatile int64_t *)&c->stop) return 0;
-            advance(c, k, i, s, x, k1);
-            if (++i == c->substeps) break;
-            start(c, k, i, s, x, k1);
+            advance(c, k, i, part, s, x, k1);
+            i += ++part == first_part(c, k * c->substeps + i + 1);
+            if (i == c->substeps) break;
+            start(c, k, i, part, s, x, k1);
         }
     }
     EACH_VECTOR(g) end(c, at + g * W_LANES, s + g, x[g]);

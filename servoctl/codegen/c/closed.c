@@ -75,8 +75,11 @@ int64_t FN(closed)(Step *law, Loop *c)
                 const int64_t sent = step - c->transport[i];
                 p[c->at_u + i] = sent < 0 ? c->initial_input[i] : c->input[sent / c->substeps * c->n_u + i];
             }
-            advance(c, t + (double)s * h, h, c->disturbance + 3 * step * c->n_d, x, p);
-            restore(t + (double)(s + 1) * h, x, p);
+            for (int64_t i = first_part(c, step); i < first_part(c, step + 1); i++) {
+                const double begun = begin_of(c, k, s, i), length = length_of(c, i, h);
+                advance(c, begun, length, c->disturbance + 3 * i * c->n_d, x, p);
+                restore(begun + length, x, p);
+            }
             if (--left > 0) continue;
             for (int i = 0; i < NX; i++) c->state[i] = x[i];
             c->sample = k + (s + 1) / c->substeps;

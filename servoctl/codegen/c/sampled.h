@@ -11,13 +11,23 @@ typedef struct {
     int64_t stride;                      /* numbers from a row of law_x to the next; 0 where it follows from x */
     double t0, period;
     const double *p, *x0, *z0, *table, *noise, *quantum, *low, *high, *change, *initial_input, *disturbance;
+    const double *spans; /* of parts of integration steps [s]: begin after that of the step, and length */
     const double *constants, *scale, *deviations;
-    const int64_t *measured, *transport, *disturbed, *traced;
+    const int64_t *measured, *transport, *disturbed, *traced, *parts;
     const uint64_t *keys;
     double *state, *x, *law_x, *law_y, *input; /* the state and logs of one loop */
     double *gathered, *trace;          /* and of many */
     Step *law;                         /* which is called, where the law is not written into the loop */
 } Loop;
+
+/* Edges of disturbances cut integration steps into parts: the first of a step; begin [s] of one of step i of sample k. */
+INLINE int64_t first_part(const Loop *c, int64_t step) { return c->parts ? c->parts[step] : step; }
+INLINE double begin_of(const Loop *c, int64_t k, int64_t i, int64_t part)
+{
+    const double step = c->t0 + (double)k * c->period + (double)i * (c->period / (double)c->substeps);
+    return c->parts ? step + c->spans[2 * part] : step;
+}
+INLINE double length_of(const Loop *c, int64_t part, double h) { return c->parts ? c->spans[2 * part + 1] : h; }
 
 INLINE V quantised(const Loop *c, int64_t i, V value)
 {

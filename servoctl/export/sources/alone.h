@@ -5,6 +5,7 @@
 #define NQ 2
 #define NX 4
 #define NY 8
+#define NJ 6
 #define FIRST 2
 #define NU 2
 #define NZ 1

@@ -2,13 +2,12 @@
 /* Jets z = (x, highest derivative) and actuation u at state x of the plan. */
 static int feedforward(double t, const double *x, const double *p, double *z, double *u)
 {
-    double dx[NX];
+    double dx[NX], jets[NJ];
     if (!(t - t == 0)) return -1;
     rates(t, x, p, dx);
-    for (int i = 0; i < NX; i++) z[i] = x[i];
-    for (int i = 0; i < N; i++) z[NX + i] = dx[NX - N + i];
-    actuation(t, z, p, u);
-    return 0;
+    for (int i = 0; i < NX; i++) jets[i] = x[i];
+    for (int i = 0; i < N; i++) jets[NX + i] = dx[NX - N + i];
+    return answer(t, jets, p, z, u);
 }
 
 /* A Runge-Kutta step of order 4 of the state x from t to t + h. */
@@ -23,6 +22,8 @@ static int advance(double t, double h, double *x, const double *p)
     rates(t + 0.5 * h, y, p, k[2]);
     for (int i = 0; i < NX; i++) y[i] = x[i] + h * k[2][i];
     rates(t + h, y, p, k[3]);
-    for (int i = 0; i < NX; i++) x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+    for (int i = 0; i < NX; i++) y[i] = x[i] + h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+    for (int i = 0; i < NX; i++) if (!(y[i] - y[i] == 0)) return -1;
+    for (int i = 0; i < NX; i++) x[i] = y[i];
     return 0;
 }

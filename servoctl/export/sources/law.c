@@ -16,7 +16,7 @@ static int step(double t, const double *y, double *z, double *u)
     for (int i = 0; i < NZ; i++) x[NY + i] = z[i];
     schedule((int)k, row);
     law(t, x, row, all);
-    for (int i = 0; i < NU; i++) if (!(all[i] - all[i] == 0)) return -1;
+    for (int i = 0; i < NU + NZ; i++) if (!(all[i] - all[i] == 0)) return -1;
     for (int i = 0; i < NU; i++) u[i] = all[i];
     for (int i = 0; i < NZ; i++) z[i] = all[NU + i];
     return 0;

@@ -2,7 +2,7 @@
 /* Newton's method for the coordinates in x, whose rates and second derivatives follow; the number of corrections. */
 static int feedforward(double t, double *x, const double *p, double *z, double *u)
 {
-    double y[NY], before = HUGE_VAL;
+    double y[NY], jets[NJ], before = HUGE_VAL;
     if (!(t - t == 0)) return -1;
     for (int iteration = 0; iteration <= ITERATIONS; iteration++) {
         double defect = 0;
@@ -13,11 +13,10 @@ static int feedforward(double t, double *x, const double *p, double *z, double *
             if (e > defect) defect = e;
         }
         if (defect <= TOLERANCE || (defect <= STALLED && defect >= before / 2)) {
-            for (int i = 0; i < NQ; i++) z[i] = x[i];
-            for (int i = 0; i < 2 * N; i++) z[NQ + i] = y[FIRST + i];
-            for (int i = 0; i < N; i++) x[NQ + i] = z[NQ + i];
-            actuation(t, z, p, u);
-            return iteration;
+            for (int i = 0; i < NQ; i++) jets[i] = x[i];
+            for (int i = 0; i < 2 * N; i++) jets[NQ + i] = y[FIRST + i];
+            for (int i = 0; i < N; i++) x[NQ + i] = jets[NQ + i];
+            return answer(t, jets, p, z, u) ? -1 : iteration;
         }
         for (int i = 0; i < NQ; i++) x[i] += y[i];
         before = defect;
