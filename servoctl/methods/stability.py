@@ -250,6 +250,12 @@ def warn_unstable(verdict):
     )
 
 
+def warn_transient(sentence):
+    """Warn of a first transient, if there is a sentence that says so."""
+    if sentence:
+        warnings.warn(f"{sentence}.", RuntimeWarning, stacklevel=_outside())
+
+
 def warn_drifted(name, residual, t, method):
     """Warn that the residual of a constraint has drifted away from zero by the end of a motion at t [s]."""
     warnings.warn(

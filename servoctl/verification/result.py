@@ -59,6 +59,9 @@ class Verification(Detailed):
         Largest value of each number that passes.
     doubts : tuple of str
         What could not be checked, why, and what to do.
+    remarks : tuple of str
+        What a reader should know of a motion that may have passed: a first transient, forces, limits, growth, samples;
+        for a loop its error and its rate. Printed, it has the first of them.
     """
 
     numbers: dict
@@ -66,6 +69,7 @@ class Verification(Detailed):
     notes: tuple = ()
     limits: dict = field(default_factory=dict)
     doubts: tuple = ()
+    remarks: tuple = ()
 
     @property
     def verdict(self):
@@ -78,7 +82,7 @@ class Verification(Detailed):
         return self.verdict == PASSED
 
     def _tables(self):
-        return [(CHECK, self.rows())], (*self.doubts, *self.notes)
+        return [(CHECK, self.rows())], (*self.remarks[:1], *self.doubts, *self.notes)
 
     def rows(self):
         """For each number its name, value, limit, whether it is "within" or "beyond" that, and what it is: texts."""
@@ -94,7 +98,8 @@ class Verification(Detailed):
         said = {FAILED: f"FAILED: {', '.join(self.failures)}"}.get(self.verdict, self.verdict)
         checks = [key for key in WORDS if key in self.numbers] + [key for key in residuals if full or key == worst]
         checks.sort(key=lambda key: key not in self.failures)  # what failed comes first
-        first = [f"  {text}" for text in (*self.doubts, *self.notes)]
+        remarks = self.remarks if full else self.remarks[:1]
+        first = [f"  {text}" for text in (*remarks, *self.doubts, *self.notes)]
         return [f"Verification: {said}", *first, *map(self._line, checks)]
 
     def _line(self, key):
@@ -104,10 +109,10 @@ class Verification(Detailed):
         return f"  {self.numbers[key]:7.1e}, {allowed}: {words}{'  FAILED' * (key in self.failures)}"
 
 
-def judged(numbers, limits, notes=(), doubts=()):
+def judged(numbers, limits, notes=(), doubts=(), remarks=()):
     """The verification of numbers with their limits; a number that is NaN fails."""
     failures = tuple(key for key, value in numbers.items() if not value <= limits[key])
-    return Verification(numbers, failures, tuple(notes), limits, tuple(doubts))
+    return Verification(numbers, failures, tuple(notes), limits, tuple(doubts), tuple(remarks))
 
 
 def largest(values):

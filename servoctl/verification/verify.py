@@ -20,6 +20,7 @@ from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
 from servoctl.values import frozen
 from servoctl.verification.between import AGREES, ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
+from servoctl.verification.remarks import of_run
 from servoctl.verification.result import Verification, judged, largest, numbers
 
 LIMITS = {
@@ -101,7 +102,7 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     }
     found |= {"segments": checks.segments()} if len(run.t) > 1 else {}
     limits = {key: checks.limit("residual" if key.startswith("residual ") else key) for key in found}
-    return judged(found, limits, checks.notes, checks.doubts)
+    return judged(found, limits, checks.notes, checks.doubts, of_run(run))
 
 
 # --- what is verified
@@ -750,4 +751,3 @@ def _ratio(errors, sizes):
         return errors / sizes
     sizes = np.broadcast_to(sizes, np.shape(errors))
     return np.divide(errors, sizes, out=np.where(errors == 0, 0.0, np.inf), where=sizes > 0)
-
