@@ -47,7 +47,7 @@ from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.sizes import sizes_of, state_levels
-from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_transient, warn_unstable
+from servoctl.methods.stability import run_checked, warn, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
@@ -163,7 +163,8 @@ def simulate(
     again = None if dense is None else partial(motion, dense)
     first = method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None))
     run = _sampled(judged(run, tolerance, again, _series_of(run, first)), None if dense is None else times)
-    warn_transient(first_transient(run, partial(simulated, model)))
+    if said := first_transient(run, partial(simulated, model)):
+        warn(f"{said}.")
     return run
 
 

@@ -30,6 +30,7 @@ from servoctl.inversion.verdict import (
     verdict,
 )
 from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
+from servoctl.methods.stability import warn
 from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.plant import plant
@@ -164,7 +165,7 @@ class Request:
         found, instead = self.instead(model, begin, found, run)
         if instead or found.dynamics != GROWS:
             return instead or _with_reason(run, found)
-        warnings.warn(f"An ideal program has no other inverse, and this is {found}.", RuntimeWarning, stacklevel=3)
+        warn(f"An ideal program has no other inverse, and this is {found}.")
         return _with_reason(run, found)
 
     def instead(self, model, begin, found, run):
@@ -280,18 +281,16 @@ def _by_hand(request, model, begin, found, chosen, method):
     expected = {FLAT: Algebraic, MINIMUM: Method, MARGINAL: Method, HYPERBOLIC_ZEROS: Bounded}.get(found.dynamics, ())
     fits = method == RELAXED or isinstance(method, expected)
     if not fits:
-        warnings.warn(
+        warn(
             f"method={str(method)!r} was chosen for a program that is {found}. sv.inverse without method takes "
-            f"{'the bounded motion' if isinstance(chosen, Bounded) else 'the relaxed inverse'}.",
-            RuntimeWarning,
-            stacklevel=3,
+            f"{'the bounded motion' if isinstance(chosen, Bounded) else 'the relaxed inverse'}."
         )
     if method == RELAXED:
         return request.relaxed(found, begin)
     run = request.exact(model, begin, found, method)
     excess = _excess(run, {**request.ranges[0], **request.ranges[1]})
     if excess:
-        warnings.warn(f"method={str(method)!r} was chosen, and {excess}.", RuntimeWarning, stacklevel=3)
+        warn(f"method={str(method)!r} was chosen, and {excess}.")
     return _with_reason(run, found)
 
 
@@ -329,7 +328,7 @@ def _swinging(run):
         return ""
     what = f"the internal motion goes on after it, with {name} = {speeds[name][-1]:.3g} at t = {run.t[-1]:.4g} s"
     do = "" if run.model.ideal else " method='relaxed' rests at both ends, as near to the program as that is."
-    warnings.warn(f"The program is marginal, and {what}.{do}", RuntimeWarning, stacklevel=5)
+    warn(f"The program is marginal, and {what}.{do}")
     return f"; {what}"
 
 
@@ -338,7 +337,7 @@ def _measured(run, program, dynamics):
     if run.method != RELAXED:
         return run
     largest = {name: float(np.abs(run.residual[name][0]).max()) for name in program.names}
-    strokes = {name: float(np.ptp(path(run, program.residuals[name]))) for name in largest}
+    strokes = {name: path(run, program.residuals[name])[0] for name in largest}
     usual = max(strokes.values())
     parts = {name: largest[name] / (stroke or usual) for name, stroke in strokes.items() if stroke or usual}
     if not parts:
@@ -348,5 +347,5 @@ def _measured(run, program, dynamics):
         return run
     missed = f"the plan misses {name} by {largest[name]:.3g}, {100 * parts[name]:.2g} % of its stroke"
     do = REMEDIES.get(dynamics, "Allow more time or wider limits, or a smaller weight.")
-    warnings.warn(f"{missed[0].upper()}{missed[1:]}. {do}", RuntimeWarning, stacklevel=3)
+    warn(f"{missed[0].upper()}{missed[1:]}. {do}")
     return replace(run, message=f"{run.message}; {missed}")

@@ -15,57 +15,57 @@ def first_transient(run, motion):
 
     `motion(start, span)` is the run of the same model from a state over a span (t0, t1) [s].
     """
-    model, names = run.model, [name for name in run.model.actuators if name in run.names]
+    model, start, names = run.model, run.start, [name for name in run.model.actuators if name in run.names]
     rests = not run.jets[model.nq :, 0].any()  # and has no transient
-    if rests or not (run.success and run.start and model.free and names and run.t[0] < run.t[-1]):
+    if rests or not (run.success and start and model.free and names and run.t[0] < run.t[-1]):
         return ""
     sizes = np.abs([run[name] for name in names])
     falls = [int(np.argmin(np.append(np.diff(size) < 0, False))) for size in sizes]
     later, rounding = np.array([s[k:].max() for s, k in zip(sizes, falls, strict=True)]), AGREES * sizes.max()
     a = int(np.argmax(sizes[:, 0] / (later + rounding)))
+    first, most = (digits(float(size), 4) for size in (run[names[a]][0], later[a]))
     if sizes[a, 0] <= later[a] + rounding or digits(sizes[a, 0], 3) == digits(later[a], 3):
         return ""
-    call = next(filter(None, (_call(x, model, later + rounding) for x in _attracted(run, run.t[falls[a]], motion))), "")
-    values = ", ".join(f"{name} = {run[name][0]:.4g}" for name in run.start.held or run.start.free if name in run.names)
-    cause = f"; {values} {'was held' if run.start.held else 'was left free'}" * bool(values)
-    first, most = (f"{digits(size, 4)} {run.unit(names[a])}".rstrip() for size in (run[names[a]][0], later[a]))
-    told = (
-        f"{names[a]} begins at {first}, a first transient: later it is at most {most}{cause}. Start without it: {call}"
-    )
-    return told * bool(call)
+    values = ", ".join(f"{name} = {run[name][0]:.4g}" for name in start.held or start.free if name in run.names)
+    cause = f", as {values} {'was held' if start.held else 'was left free'}" * bool(values)
+    for state in _attracted(run, run.t[falls[a]], motion):
+        if call := _call(state, model, later + rounding):
+            told = f"{names[a]} has a first transient of {first} {run.unit(names[a])}".rstrip()
+            return f"{told} and is at most {most} later{cause}. Start without it: {call}"
+    return ""
 
 
-@np.errstate(all="ignore")
 def _attracted(run, fallen, motion):
-    """States beside the start: a rest near its coordinates, and where motions that began earlier have come to.
+    """Starts beside that of a run: a rest, and where motions that began earlier have come to by then.
 
     They begin as long before as the run lasts, or as the transient does until it has `fallen` [s].
     """
-    model, t0 = run.model, run.t[0]
+    model, t0 = run.model, float(run.t[0])
     known = dict(zip(model.state_names, run.jets[:, 0].tolist(), strict=False))
     for length in (0.0, run.t[-1] - t0, fallen - t0):
         guess = {name: value for name, value in known.items() if length or name in model.coordinate_names}
-        with warnings.catch_warnings(action="ignore"):
-            try:
-                start = model.start(float(t0 - length), guess=guess)
-                x = motion(start, (t0 - length, t0)).jets[: len(known), -1] if length else start.values
-                yield model.start(float(t0), guess=dict(zip(known, without_rounding(x).tolist(), strict=True)))
-            except ServoError:
-                continue
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                state = model.start(t0 - length, guess=guess)
+                x = motion(state, (state.t, t0)).jets[: len(known), -1] if length else state.values
+                yield model.start(t0, guess=dict(zip(known, without_rounding(x).tolist(), strict=True)))
+        except ServoError:
+            continue
 
 
 def _call(state, model, later):
     """The call of a start by as few digits of its free values as serve; "" if a force is above its `later` peaks."""
-    names, f = model.signals("actuation")
     for most in (4, 8, 16):
         held = {name: float(f"{state[name]:.{most}g}") for name in state.free}
         guess = {name: float(f"{state[name]:.4g}") for name in model.coordinate_names if name not in held}
         try:
-            t, x = np.array([state.t]), model.start(state.t, guess=guess, **held).values[:, None]
+            x = model.start(state.t, guess=guess, **held).values[:, None]
         except ServoError:
             continue
-        forces = np.abs(f.grid(t, model.with_highest(t, x)[: f.n_x], model.parameters)[:, 0])
-        if (forces[[names.index(name) for name in model.actuators if name in names]] <= later).all():
-            given = [f"t={state.t:g}"] * bool(state.t) + [f"{name}={value!r}" for name, value in held.items()]
-            return f"model.start({', '.join([*given, *[f'guess={guess}'] * bool(guess)])})"
+        names, f = model.signals("actuation")
+        forces = f.grid([state.t], model.with_highest([state.t], x)[: f.n_x], model.parameters)[:, 0]
+        forces = np.array([force for name, force in zip(names, forces, strict=True) if name in model.actuators])
+        if (np.abs(forces) <= later).all():
+            values = [f"t={state.t:g}"] * bool(state.t) + [f"{name}={value}" for name, value in held.items()]
+            return f"model.start({', '.join([*values, *[f'guess={guess}'] * bool(guess)])})"
     return ""

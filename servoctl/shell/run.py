@@ -75,15 +75,15 @@ def _compute(args, name, scene, folder):
     folder.write(lambda path: run.save(path / "run.npz"))
     verification = None if args.no_verify else _verify(run, report)
     closed, done = loop.closed_loop(args, motion.model, run, report)
-    remarks = (*getattr(verification, "remarks", ()), *(of_loop(closed) if closed else ()))
-    if remarks and remarks[0] not in report.text:
-        report.say(f"Loop: {remarks[0]}")
+    of_closed = () if closed is None else of_loop(closed)
+    for said in of_closed[:1]:
+        report.say(f"Loop: {said}")
     if closed is not None:
         folder.write(lambda path: closed.save(path / "closed_loop.npz"))
     about = {"name": name, "given": args.scene, "description": scene.description}
     facts = {"scene": about, "command": args.command_line, "t_span": motion.span}
     facts |= {"verdict": found.word, "verdict_facts": found.as_dict(), **summary(run, motion.start, verification)}
-    facts |= {"closed_loop": loop.facts(closed), "remarks": remarks}
+    facts |= {"closed_loop": loop.facts(closed), "remarks": [*getattr(verification, "remarks", ()), *of_closed]}
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)
     motion = _pictures_of(args, folder, name, run, closed)
@@ -136,8 +136,11 @@ def _planned(args, motion, report):
             return whole, *_simulate(whole, _options(args, model, window) | {"method": method})
         request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
         run = request.relaxed(found, start) if method else found and request.instead(model, start, found, forward[0])[1]
+        if run is not None and args.samples:
+            run = resampled(run, np.array(options["t_eval"]))
+            run = replace(run, jets=run.model.with_highest(run.t, run.jets[: len(run.model.state_names)]))
         if run is not None:
-            return motion, resampled(run, np.array(options["t_eval"])) if args.samples else run, ""
+            return motion, run, ""
     except ServoError as error:
         report.say(f"There is no {method or 'relaxed'} motion: {error}")
     return motion, *(forward or _simulate(motion, options))

@@ -7,7 +7,6 @@ from casadi import depends_on
 
 from servoctl.control.loop import FINISHED, run_loop
 from servoctl.errors import SpecificationError
-from servoctl.verification.remarks import of_loop
 from servoctl.verification.result import judged, largest, numbers
 
 LOOP_LIMITS = {"loop power": 1e-3, "loop constraints": 1e-8, "loop limits": 1e-12, "loop repeated": 1e-9}  # relative
@@ -45,7 +44,7 @@ def verify_loop(closed):
         found["loop constraints"] = worst / max(1.0, np.abs(closed.states).max())
     if plant.limits or plant.rate_limits:
         found["loop limits"] = _excess(closed)
-    return judged(found, {name: limits[name] for name in found}, notes, remarks=of_loop(closed))
+    return judged(found, {name: limits[name] for name in found}, notes)
 
 
 def _driven(closed):

@@ -60,8 +60,7 @@ class Verification(Detailed):
     doubts : tuple of str
         What could not be checked, why, and what to do.
     remarks : tuple of str
-        What a reader should know of a motion that may have passed: a first transient, forces, limits, growth, samples;
-        for a loop its error and its rate. Printed, it has the first of them.
+        What else a reader should know, such as a first transient; the first of them is printed.
     """
 
     numbers: dict
@@ -98,8 +97,7 @@ class Verification(Detailed):
         said = {FAILED: f"FAILED: {', '.join(self.failures)}"}.get(self.verdict, self.verdict)
         checks = [key for key in WORDS if key in self.numbers] + [key for key in residuals if full or key == worst]
         checks.sort(key=lambda key: key not in self.failures)  # what failed comes first
-        remarks = self.remarks if full else self.remarks[:1]
-        first = [f"  {text}" for text in (*remarks, *self.doubts, *self.notes)]
+        first = [f"  {text}" for text in (*self.remarks[: None if full else 1], *self.doubts, *self.notes)]
         return [f"Verification: {said}", *first, *map(self._line, checks)]
 
     def _line(self, key):
@@ -109,10 +107,10 @@ class Verification(Detailed):
         return f"  {self.numbers[key]:7.1e}, {allowed}: {words}{'  FAILED' * (key in self.failures)}"
 
 
-def judged(numbers, limits, notes=(), doubts=(), remarks=()):
+def judged(numbers, limits, notes=(), doubts=()):
     """The verification of numbers with their limits; a number that is NaN fails."""
     failures = tuple(key for key, value in numbers.items() if not value <= limits[key])
-    return Verification(numbers, failures, tuple(notes), limits, tuple(doubts), tuple(remarks))
+    return Verification(numbers, failures, tuple(notes), limits, tuple(doubts))
 
 
 def largest(values):
