@@ -240,7 +240,7 @@ def test_a_loop_that_is_too_slow_for_its_path(hertz, rate):
     closed = sv.close(plant, sv.lqr(plan, plant, rate), plan.state(0.0), (0.0, 1.0))
     off = np.abs(closed.residual["Z"][0]).max() / 0.04
     told = [one for one in sv.verify(closed).remarks if "path's own size" in one]
-    assert len(told) == (off > 0.1) == (hertz > 3)
+    assert len(told) == (off > 1 / 3) == (hertz > 3)
     assert all(one.startswith(f"{rate / hertz:.2g} samples per period") and f"{off:.2g} times" in one for one in told)
 
 

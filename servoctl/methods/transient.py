@@ -15,15 +15,16 @@ def first_transient(run, motion):
 
     `motion(start, span)` is the run of the same model from a state over a span (t0, t1) [s].
     """
-    model, start, names = run.model, run.start, [name for name in run.model.actuators if name in run.names]
+    model, start = run.model, run.start
     rests = not run.jets[model.nq :, 0].any()  # and has no transient
-    if rests or not (run.success and start and model.free and names and run.t[0] < run.t[-1]):
+    if rests or not (run.success and start and model.free and model.actuators and run.t[0] < run.t[-1]):
         return ""
-    sizes = np.abs([run[name] for name in names])
+    names, forces = run.signals("actuation")
+    sizes = np.abs(forces)
     falls = [int(np.argmin(np.append(np.diff(size) < 0, False))) for size in sizes]
     later, rounding = np.array([s[k:].max() for s, k in zip(sizes, falls, strict=True)]), AGREES * sizes.max()
     a = int(np.argmax(sizes[:, 0] / (later + rounding)))
-    first, most = (digits(float(size), 4) for size in (run[names[a]][0], later[a]))
+    first, most = (digits(float(size), 4) for size in (forces[a, 0], later[a]))
     if sizes[a, 0] <= later[a] + rounding or digits(sizes[a, 0], 3) == digits(later[a], 3):
         return ""
     values = ", ".join(f"{name} = {run[name][0]:.4g}" for name in start.held or start.free if name in run.names)
@@ -62,9 +63,8 @@ def _call(state, model, later):
             x = model.start(state.t, guess=guess, **held).values[:, None]
         except ServoError:
             continue
-        names, f = model.signals("actuation")
+        f = model.signals("actuation")[1]
         forces = f.grid([state.t], model.with_highest([state.t], x)[: f.n_x], model.parameters)[:, 0]
-        forces = np.array([force for name, force in zip(names, forces, strict=True) if name in model.actuators])
         if (np.abs(forces) <= later).all():
             values = [f"t={state.t:g}"] * bool(state.t) + [f"{name}={value}" for name, value in held.items()]
             return f"model.start({', '.join([*values, *[f'guess={guess}'] * bool(guess)])})"

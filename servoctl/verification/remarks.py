@@ -12,7 +12,7 @@ from servoctl.methods.transient import first_transient
 from servoctl.run import AGREES
 from servoctl.simulation import simulated
 
-TIMES, SAMPLES = 10, 3  # an order of magnitude, which is worth a sentence; samples of a loop in a time constant
+TIMES, SAMPLES = 10, 3  # of the weights, of the samples; of a loop in a time constant, and of its error in its path
 
 
 def of_run(run):
@@ -108,7 +108,7 @@ def least_rate(plan, plant):
 
 
 def _off_path(closed):
-    """On the largest error beside the size of its path, where it is no small part of that."""
+    """On the largest error beside the size of its path, where three of it exceed that."""
     plan, said = closed.plan, {0.0: ""}
     residuals = plan.model.reduction.program.residuals if plan is not None and plan.model else {}
     for name in residuals.keys() & {*closed.residual}:
@@ -116,4 +116,4 @@ def _off_path(closed):
         off = float(np.abs(closed.residual[name][0]).max()) / (size or np.inf)
         count = f"{digits(2 * np.pi * closed.law.rate / (rate or 1), 2)} samples per period of the plan; " * bool(rate)
         said[off] = f"{count}the loop's error of {name} is {digits(off, 2)} times the path's own size"
-    return said[max(said)] * bool(max(said) * TIMES > 1)
+    return said[max(said)] * bool(max(said) * SAMPLES > 1)
