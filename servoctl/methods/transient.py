@@ -15,9 +15,9 @@ def first_transient(run, motion):
 
     `motion(start, span)` is the run of the same model from a state over a span (t0, t1) [s].
     """
-    model, start = run.model, run.start
-    rests = not run.jets[model.nq :, 0].any()  # and has no transient
-    if rests or not (run.success and start and model.free and model.actuators and run.t[0] < run.t[-1]):
+    model, start, moves = run.model, run.start, run.jets[run.model.nq :, 0].any()  # at rest there is no transient
+    driven = model.reduction.mechanism.actuators and not model.ideal
+    if not (moves and driven and model.free and start and run.success and run.t[0] < run.t[-1]):
         return ""
     names, forces = run.signals("actuation")
     sizes = np.abs(forces)
