@@ -47,9 +47,10 @@ from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.sizes import sizes_of, state_levels
-from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
+from servoctl.methods.stability import run_checked, warn, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
+from servoctl.methods.transient import first_transient
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.model.switching import switching
@@ -161,7 +162,10 @@ def simulate(
     dense = own(DEFAULT_SAMPLES)
     again = None if dense is None else partial(motion, dense)
     first = method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None))
-    return _sampled(judged(run, tolerance, again, _series_of(run, first)), None if dense is None else times)
+    run = _sampled(judged(run, tolerance, again, _series_of(run, first)), None if dense is None else times)
+    if said := first_transient(run, partial(simulated, model)):
+        warn(f"{said}.")
+    return run
 
 
 def _series_of(run, method):

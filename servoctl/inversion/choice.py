@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_span, by_name, interval, mapping, numbers_by_name, positive_number, require_kind
@@ -31,6 +30,7 @@ from servoctl.inversion.verdict import (
     verdict,
 )
 from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
+from servoctl.methods.stability import warn
 from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.plant import plant
@@ -40,6 +40,7 @@ from servoctl.simulation import as_state, simulate
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.values import frozen
+from servoctl.verification.remarks import path
 
 RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
 END_MOVES = "; its end is open, as the program moves there"
@@ -123,7 +124,7 @@ def inverse(
         return _measured(request.relaxed(rough), program, "")
     begin = _begin(model, start, span[0])
     found = verdict(model, begin)
-    chosen = _chosen(model, found, weight is not None)
+    chosen = chosen_by(model, found, weight is not None)
     if by_hand is not None:
         return _measured(_by_hand(request, model, begin, found, chosen, by_hand), program, found.dynamics)
     return _measured(request.run(model, begin, found, chosen), program, found.dynamics)
@@ -161,15 +162,18 @@ class Request:
         excess = _excess(run, ranges)
         if excess:
             return self.relaxed(excess, begin)
-        moving = found.dynamics != MARGINAL
-        if found.dynamics == OPEN or run.internal.get("verdict") == "unstable":
-            found = verdict(model, run)
-        if found.dynamics != GROWS:
-            return _with_reason(run, found)
-        if not model.ideal:
-            return self.relaxed(found, begin, moving)
-        warnings.warn(f"An ideal program has no other inverse, and this is {found}.", RuntimeWarning, stacklevel=3)
+        found, instead = self.instead(model, begin, found, run)
+        if instead or found.dynamics != GROWS:
+            return instead or _with_reason(run, found)
+        warn(f"An ideal program has no other inverse, and this is {found}.")
         return _with_reason(run, found)
+
+    def instead(self, model, begin, found, run):
+        """The verdict with a run, and the relaxed one in its place where it grows; None where it stays."""
+        moving = found.dynamics != MARGINAL
+        if found.dynamics == OPEN or run.status < 0 or run.internal.get("verdict") == "unstable":
+            found = verdict(model, run)
+        return found, None if found.dynamics != GROWS or model.ideal else self.relaxed(found, begin, moving)
 
     def exact(self, model, begin, found, method):
         """The run of an exact inverse; integrated forward from the rest where the program begins, if there is one."""
@@ -264,7 +268,7 @@ def _of_states(model, known):
     return {name: value for name, value in known.items() if name in model.state_names}
 
 
-def _chosen(model, found, weighted):
+def chosen_by(model, found, weighted=False):
     """The method of the exact inverse, None for the default of `simulate`, or `RELAXED`."""
     if found.dynamics == HYPERBOLIC_ZEROS:
         return Bounded()
@@ -277,18 +281,16 @@ def _by_hand(request, model, begin, found, chosen, method):
     expected = {FLAT: Algebraic, MINIMUM: Method, MARGINAL: Method, HYPERBOLIC_ZEROS: Bounded}.get(found.dynamics, ())
     fits = method == RELAXED or isinstance(method, expected)
     if not fits:
-        warnings.warn(
+        warn(
             f"method={str(method)!r} was chosen for a program that is {found}. sv.inverse without method takes "
-            f"{'the bounded motion' if isinstance(chosen, Bounded) else 'the relaxed inverse'}.",
-            RuntimeWarning,
-            stacklevel=3,
+            f"{'the bounded motion' if isinstance(chosen, Bounded) else 'the relaxed inverse'}."
         )
     if method == RELAXED:
         return request.relaxed(found, begin)
     run = request.exact(model, begin, found, method)
     excess = _excess(run, {**request.ranges[0], **request.ranges[1]})
     if excess:
-        warnings.warn(f"method={str(method)!r} was chosen, and {excess}.", RuntimeWarning, stacklevel=3)
+        warn(f"method={str(method)!r} was chosen, and {excess}.")
     return _with_reason(run, found)
 
 
@@ -326,7 +328,7 @@ def _swinging(run):
         return ""
     what = f"the internal motion goes on after it, with {name} = {speeds[name][-1]:.3g} at t = {run.t[-1]:.4g} s"
     do = "" if run.model.ideal else " method='relaxed' rests at both ends, as near to the program as that is."
-    warnings.warn(f"The program is marginal, and {what}.{do}", RuntimeWarning, stacklevel=5)
+    warn(f"The program is marginal, and {what}.{do}")
     return f"; {what}"
 
 
@@ -335,7 +337,7 @@ def _measured(run, program, dynamics):
     if run.method != RELAXED:
         return run
     largest = {name: float(np.abs(run.residual[name][0]).max()) for name in program.names}
-    strokes = {name: _stroke(run, program.residuals[name]) for name in largest}
+    strokes = {name: path(run, program.residuals[name])[0] for name in largest}
     usual = max(strokes.values())
     parts = {name: largest[name] / (stroke or usual) for name, stroke in strokes.items() if stroke or usual}
     if not parts:
@@ -345,16 +347,5 @@ def _measured(run, program, dynamics):
         return run
     missed = f"the plan misses {name} by {largest[name]:.3g}, {100 * parts[name]:.2g} % of its stroke"
     do = REMEDIES.get(dynamics, "Allow more time or wider limits, or a smaller weight.")
-    warnings.warn(f"{missed[0].upper()}{missed[1:]}. {do}", RuntimeWarning, stacklevel=3)
+    warn(f"{missed[0].upper()}{missed[1:]}. {do}")
     return replace(run, message=f"{run.message}; {missed}")
-
-
-def _stroke(run, residual):
-    """How far time moves a residual at the first state of a run."""
-    q = run.model.reduction.mechanism.q
-    orders = range(max(q.order(residual), 0) + 1)
-    names = [name for k in orders for name in q.jet_names(k)]
-    jets = [run[name][0] if name in run.jet_names else 0.0 for name in names]
-    symbols = ca.vertcat(*run.model.reduction.mechanism.parameters.symbols)
-    f = ca.Function("residual", [q.t, ca.vertcat(*(q.jet(k) for k in orders)), symbols], [residual])
-    return float(np.ptp([float(f(t, jets, run.model.parameters)) for t in run.t]))

@@ -212,12 +212,10 @@ def warn_fast_poles(method, poles, step):
     if limits:
         largest, limit, pole, row = min(limits, key=lambda entry: entry[0])
         number = f"{pole.real:g}" if pole.imag == 0 else f"{pole:g}"
-        warnings.warn(
+        warn(
             f"Steps of {abs(step):.4g} s by {method} amplify the error dynamics of {row!r}, which the pole {number} "
             f"1/s should damp: |λ|h = {abs(pole * step):.4g} exceeds {limit:.4g}. The largest stable step is "
-            f"{largest:.4g} s. Use it, slower poles, or drift='project'.",
-            RuntimeWarning,
-            stacklevel=_outside(),
+            f"{largest:.4g} s. Use it, slower poles, or drift='project'."
         )
 
 
@@ -232,31 +230,25 @@ def warn_many_steps(method, poles, length):
     rate, pole, row = max(steps, key=lambda entry: entry[0], default=(0.0, 0.0, ""))
     count = rate * abs(length)
     if count > MANY_STEPS:
-        warnings.warn(
+        warn(
             f"The pole {pole:g} 1/s of {row!r} limits the steps of {method} to {1 / rate:.2g} s: {count:.1g} steps "
-            "over the span. Use slower poles, drift='project', or 'RadauIIA'.",
-            RuntimeWarning,
-            stacklevel=_outside(),
+            "over the span. Use slower poles, drift='project', or 'RadauIIA'."
         )
 
 
 def warn_unstable(verdict):
     """Warn that the internal dynamics of a motion are unstable; the verdict says over which time, and how far."""
-    warnings.warn(
+    warn(
         f"{verdict[0].upper()}{verdict[1:]}. The program does not determine this motion well. Take a shorter span or "
-        "another output; sv.lqr stabilises the whole state about a plan.",
-        RuntimeWarning,
-        stacklevel=_outside(),
+        "another output; sv.lqr stabilises the whole state about a plan."
     )
 
 
 def warn_drifted(name, residual, t, method):
     """Warn that the residual of a constraint has drifted away from zero by the end of a motion at t [s]."""
-    warnings.warn(
+    warn(
         f"The residual of {name!r} has drifted to {residual:.2g} at t = {t:.6g} s: {method} does not keep the program "
-        "so long. Use drift='project', poles by a time constant, shorter steps or a smaller rtol.",
-        RuntimeWarning,
-        stacklevel=_outside(),
+        "so long. Use drift='project', poles by a time constant, shorter steps or a smaller rtol."
     )
 
 
@@ -316,12 +308,10 @@ def _warn_unresolved(stepping, explicit, ends, x, difference, size):
         stable = largest_explicit(stepping.method) / _fastest_rate(stepping, t, x, difference, size)
         if stable < length:
             bound = f" The largest stable step there is about {stable:.2g} s."
-    warnings.warn(
+    warn(
         f"Steps of {length:.4g} s by {stepping.method} do not resolve the motion: at t = {t:.6g} s one step and two of "
         f"half its length differ by {np.abs(difference).max():.2g} of the size of the state.{bound} Use shorter steps, "
-        "'RadauIIA' with adaptive steps, or accuracy=1e-6.",
-        RuntimeWarning,
-        stacklevel=_outside(),
+        "'RadauIIA' with adaptive steps, or accuracy=1e-6."
     )
 
 
@@ -335,9 +325,9 @@ def _fastest_rate(stepping, t, x, direction, size):
     return rate
 
 
-def _outside():
-    """The stacklevel, in the calling function, of the first caller outside the package."""
-    level, frame = 1, sys._getframe(1)
+def warn(text):
+    """Warn the first caller outside the package."""
+    level, frame = 1, sys._getframe()
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
         level, frame = level + 1, frame.f_back
-    return level
+    warnings.warn(text, RuntimeWarning, stacklevel=level)

@@ -159,7 +159,8 @@ class Robot:
     ) -> Mechanism:  # fmt: skip
         """The mechanism of the robot: its balance by the recursive Newton-Euler scheme, gravity and damping.
 
-        Figures show each link as a line from the frame of the link that carries it to its own.
+        Figures show each link as a line from the frame of the link that carries it to its own. Efforts and positions of
+        the file are its `limits`, of which `verify` says where a motion is beyond them.
 
         Parameters
         ----------
@@ -187,7 +188,7 @@ class Robot:
         NameUnknown
             If an actuator names no joint.
         """
-        names = self.q.force_names
+        names, driven = self.q.force_names, self._driven(actuators)
         total = {name: ca.SX(0) for name in names}
         for name, value in mapping(forces, "The forces").items():
             named(name, names, "coordinate" if self.q.plain else "quasi-velocity")
@@ -197,7 +198,7 @@ class Robot:
         mechanism = Mechanism(
             self.q,
             potential=potential_energy(self._kinematics, self._gravity),
-            actuators=self._driven(actuators),
+            actuators=driven,
             parameters=self.parameters if parameters is None else parameters,
             kinetic=kinetic_energy(self._kinematics),
             balance=inverse_dynamics(self._kinematics, self.q.n),
@@ -206,6 +207,9 @@ class Robot:
             constraints=constraints,
             outputs=outputs,
             shapes=self._lines(),
+            limits={
+                name: value for name, value in (self.effort | self.position).items() if name in (*driven, *self.q.names)
+            },
         )
         mechanism.passive = tuple(self.effort.keys() - mechanism.actuators)
         return mechanism

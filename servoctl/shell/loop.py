@@ -7,6 +7,7 @@ from servoctl.checks import named
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.figures.style import write_png
 from servoctl.shell.options import MANY, assignment, by_name, deviation, limits, positive, used, whole
+from servoctl.verification.remarks import SAMPLES, least_rate
 
 LAWS = ("lqr", "computed", "feedforward")
 GIVEN = ("machine", "law", "integral", "rate", "delay", "noise", "seed", "limit")
@@ -20,7 +21,9 @@ def add_loop(parser):
     loop.add_argument("--machine", type=assignment, metavar="NAME=VALUE", **MANY, help=machine)
     loop.add_argument("--law", choices=LAWS, help="default: lqr, about the plan")
     loop.add_argument("--integral", action="store_true", help="LQR: add integrals of the residuals")
-    loop.add_argument("--rate", type=positive, metavar="HZ", help=f"samples per second; default {RATE:g}")
+    loop.add_argument(
+        "--rate", type=positive, metavar="HZ", help=f"samples per second; default {RATE:g}, or what the plan needs"
+    )
     loop.add_argument("--delay", type=whole, metavar="N", help="samples from the measurement to the input")
     loop.add_argument("--noise", type=deviation, metavar="NAME=STD", **MANY, help="noise of measured states")
     loop.add_argument("--seed", type=whole, help="seed of the noise")
@@ -69,7 +72,7 @@ def closed_loop(args, model, plan, report):
         report.say(f"Closed loop: left out, as {why}.")
         return None, not requested
     try:
-        run = _closed(args, model, plan)
+        run = _closed(args, model, plan, report)
     except ServoError as error:
         report.say(f"Closed loop: {type(error).__name__}: {error}")
         return error.run if error.run is not None and len(error.run.t) else None, not requested
@@ -79,21 +82,25 @@ def closed_loop(args, model, plan, report):
     return run, run.success or not requested
 
 
-def _closed(args, model, plan):
+def _closed(args, model, plan, report):
     mechanism = model.reduction.mechanism
     parameters = dict(zip(mechanism.parameters.names, model.parameters.tolist(), strict=True))
     limits, noise = by_name(args.limit, "--limit"), by_name(args.noise, "--noise")
     nominal = sv.plant(mechanism, limits=limits, **parameters)
     machine = sv.plant(mechanism, limits=limits, **parameters | by_name(args.machine, "--machine"))
-    law = _law(args, plan, nominal)
+    rate = max(RATE, least_rate(plan, nominal)) if args.rate is None else args.rate
+    if args.rate is None and rate > RATE:
+        report.say(
+            f"The loop runs at {rate:g} Hz, not {RATE:g}: {SAMPLES} samples in the fastest time constant of the plan"
+        )
+    law = _law(args, plan, nominal, rate)
     start, samples = float(plan.t[0]), math.floor((plan.t[-1] - plan.t[0]) * law.rate * (1 + 1e-12) + 1e-9)
     span = (start, start + samples / law.rate)
     sensors, timing = sv.Sensors(noise=noise, seed=args.seed), sv.Timing(delay=args.delay or 0)
     return sv.close(machine, law, plan.state(start), span, sensors=sensors, timing=timing)
 
 
-def _law(args, plan, nominal):
-    rate = RATE if args.rate is None else args.rate
+def _law(args, plan, nominal, rate):
     if args.law == "feedforward":
         return sv.feedforward(plan, nominal, rate)
     if args.law == "computed":

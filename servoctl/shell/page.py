@@ -63,7 +63,8 @@ def write_page(folder, facts, units, verification, report, motion):
 
 def _outcome(facts, verification):
     verified = "not verified" if verification is None else f"verification {verification.verdict}"
-    return f"{facts['verdict'][:1].upper()}{facts['verdict'][1:]}; {facts['message']}; {verified}."
+    remark = "".join(f" {said[:1].upper()}{said[1:]}." for said in facts["remarks"][:1])
+    return f"{facts['verdict'][:1].upper()}{facts['verdict'][1:]}; {facts['message']}; {verified}.{remark}"
 
 
 def _pictures(folder):

@@ -3,14 +3,18 @@
 import warnings
 from dataclasses import replace
 
+import numpy as np
+
 import servoctl as sv
 from servoctl.codegen.compiler import once
 from servoctl.codegen.function import CALLS
+from servoctl.control.reference import resampled
 from servoctl.errors import ServoError
 from servoctl.figures.animation import shows_mechanism
 from servoctl.figures.sheet import draw_sheet
 from servoctl.figures.style import write_png
-from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
+from servoctl.inversion.choice import Request, chosen_by
+from servoctl.inversion.verdict import verdict
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded, as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
@@ -23,6 +27,7 @@ from servoctl.shell.page import NAME as PAGE
 from servoctl.shell.page import write_page
 from servoctl.shell.printing import Report, complain
 from servoctl.shell.scenes import find_scene
+from servoctl.verification.remarks import of_loop
 
 SETTINGS = ("method", "drift", "accuracy", "step", "rtol", "atol")  # options that decide how a motion is computed
 INCONCLUSIVE = 3  # exit code where nothing failed and something could not be verified
@@ -62,18 +67,23 @@ def _compute(args, name, scene, folder):
     if args.method is not None:
         as_method(args.method)
     motion = described(args, scene, report, require=lambda model: loop.require(args, model))
-    motion, run = _planned(args, motion, report)
-    found = verdict(motion.model, run)
+    motion, run, ended = _planned(args, motion, report)
+    for said in filter(None, (run, ended)):
+        report.say(said)
+    found = verdict(motion.model, run if run.model is motion.model else motion.start)
     report.say(f"Verdict: {found}")
     folder.write(lambda path: run.save(path / "run.npz"))
-    verification = None if args.no_verify else _verify(motion.model, run, report)
+    verification = None if args.no_verify else _verify(run, report)
     closed, done = loop.closed_loop(args, motion.model, run, report)
+    of_closed = () if closed is None else of_loop(closed)
+    for said in of_closed[:1]:
+        report.say(f"Loop: {said}")
     if closed is not None:
         folder.write(lambda path: closed.save(path / "closed_loop.npz"))
     about = {"name": name, "given": args.scene, "description": scene.description}
     facts = {"scene": about, "command": args.command_line, "t_span": motion.span}
     facts |= {"verdict": found.word, "verdict_facts": found.as_dict(), **summary(run, motion.start, verification)}
-    facts["closed_loop"] = loop.facts(closed)
+    facts |= {"closed_loop": loop.facts(closed), "remarks": [*getattr(verification, "remarks", ()), *of_closed]}
     folder.write_json("summary.json", facts)
     folder.write_text("report.txt", report.text)
     motion = _pictures_of(args, folder, name, run, closed)
@@ -113,19 +123,27 @@ def _pictures_of(args, folder, name, run, closed):
 
 
 def _planned(args, motion, report):
-    """The motion and its run: the bounded one of unstable internal dynamics, unless a method or settings are given."""
-    options = _options(args, motion.model, motion.span)
-    if used(args, SETTINGS) or verdict(motion.model, motion.start).dynamics != HYPERBOLIC_ZEROS:
-        return motion, _simulate(motion, options, report)
-    t0, t1 = motion.span
-    span = motion.span if args.t_span else (min(t0, *motion.model.knots, t1), max(t0, *motion.model.knots, t1))
-    whole = replace(motion, span=span)
+    """The motion, its run, the one that `sv.inverse` would choose unless settings are given, and why it ended early."""
+    options, model, start, (t0, t1) = _options(args, motion.model, motion.span), motion.model, motion.start, motion.span
+    found = None if used(args, SETTINGS) or t1 < t0 else verdict(model, start)
+    method = found and chosen_by(model, found)
+    forward = None if method else _simulate(motion, options)
     try:
-        window = Problem(whole.model, span, whole.start.values).window(Bounded().window) if args.samples else span
-        return whole, _simulate(whole, _options(args, whole.model, window) | {"method": "bounded"}, report)
+        if isinstance(method, Bounded):
+            span = motion.span if args.t_span else (min(t0, *model.knots, t1), max(t0, *model.knots, t1))
+            window = Problem(model, span, start.values).window(method.window) if args.samples else span
+            whole = replace(motion, span=span)
+            return whole, *_simulate(whole, _options(args, model, window) | {"method": method})
+        request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
+        run = request.relaxed(found, start) if method else found and request.instead(model, start, found, forward[0])[1]
+        if run is not None and args.samples:
+            run = resampled(run, np.array(options["t_eval"]))
+            run = replace(run, jets=run.model.with_highest(run.t, run.jets[: len(run.model.state_names)]))
+        if run is not None:
+            return motion, run, ""
     except ServoError as error:
-        report.say(f"There is no bounded motion: {error}")
-        return motion, _simulate(motion, options, report)
+        report.say(f"There is no {method or 'relaxed'} motion: {error}")
+    return motion, *(forward or _simulate(motion, options))
 
 
 def _options(args, model, span):
@@ -141,29 +159,25 @@ def _options(args, model, span):
     return options
 
 
-def _simulate(motion, options, report):
-    """The run, or the part of it before the motion stopped."""
+def _simulate(motion, options):
+    """The run, or the part of it before the motion stopped, and why it did."""
     try:
         with warnings.catch_warnings():  # the report and the exit code say this
-            warnings.filterwarnings("ignore", "Internal dynamics unstable")
-            run = sv.simulate(motion.model, motion.start, motion.span, **options)
-        report.say(run)
-        return run
+            warnings.filterwarnings("ignore", "Internal dynamics unstable|.* a first transient")
+            return sv.simulate(motion.model, motion.start, motion.span, **options), ""
     except ServoError as error:
         if error.run is None:
             raise
-        report.say(error.run)
-        report.say(f"{type(error).__name__}: {error}")
-        return error.run
+        return error.run, f"{type(error).__name__}: {error}"
 
 
-def _verify(model, run, report):
+def _verify(run, report):
     """The verification, or None."""
     if not run.success:
         report.say("Verification: left out, as the motion ended early.")
         return None
     try:
-        verification = sv.verify(model, run)
+        verification = sv.verify(run.model, run)
     except (ServoError, KeyboardInterrupt) as error:
         report.say(f"Verification: {str(error) or 'interrupted'}")
         return None

@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, distinct, mapping, named, require_kind
+from servoctl.checks import by_name, column, distinct, interval, mapping, named, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
 from servoctl.jets.branches import as_text, cse
 from servoctl.jets.identity import spread, vanish
@@ -85,6 +85,9 @@ class Mechanism(Shown):
         Units of coordinates, quasi-velocities, actuators, outputs, parameters and "multiplier_NAME" by name, as
         figures, tables, reports and exported C show them. Those of coordinates may be given there; those of rates
         follow, and those of actuators on coordinates, N or N m.
+    limits : dict of str to float or (low, high), optional
+        What the machine allows of its coordinates, velocities, actuators, outputs and reactions by name, such as
+        {"tension": (0, None)} of a rope. `verify` says where a motion is beyond them; nothing is changed for them.
 
     Raises
     ------
@@ -93,7 +96,7 @@ class Mechanism(Shown):
         and T disagree; if there is nothing to take the balance from; if the mass matrix of `balance` is not symmetric,
         or not `mass`; if a coordinate has two units, or a name and its longer form are taken.
     NameUnknown
-        If a force names no coordinate, or a unit nothing of the mechanism.
+        If a force names no coordinate, or a unit or a limit nothing of the mechanism.
     """
 
     def __init__(
@@ -112,6 +115,7 @@ class Mechanism(Shown):
         outputs=None,
         shapes=None,
         units=None,
+        limits=None,
     ):
         self.left_out, self.whole = {}, None
         self.q = require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
@@ -134,7 +138,7 @@ class Mechanism(Shown):
         self.inputs, self.reported, self.passive = (), {}, ()
         self._refuse_orders()
         self._keep_names_apart()
-        self.units = self._units(units)
+        self.units, self.limits = self._units(units), self._limits(limits)
         self._check_balance()
         if self._inverse_dynamics is not None:
             self._refuse_doubled()
@@ -166,7 +170,7 @@ class Mechanism(Shown):
         ]  # fmt: skip
         function = as_text(q.as_function([*expressions, *self.reported.values()], p.symbols))
         facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
-        facts += [p.defaults, self.left_out, self.units]
+        facts += [p.defaults, self.left_out, self.units, self.limits]
         return json.dumps(facts) + "\n" + function
 
     def __eq__(self, other):
@@ -278,7 +282,8 @@ class Mechanism(Shown):
             shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
-        driven.units, driven.longer, driven.followers = self.units, self.longer, self.followers
+        driven.units, driven.limits = self.units, self.limits
+        driven.longer, driven.followers = self.longer, self.followers
         return driven
 
     @property
@@ -306,6 +311,11 @@ class Mechanism(Shown):
         if self._mass is None:
             return ca.jacobian(self.balance, acceleration)
         return self._mass + ca.jacobian(self._added, acceleration)
+
+    @property
+    def weight(self):
+        """Generalised forces of the potential, and what is left of a given balance at rest, (n,) SX."""
+        return self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)) + self._applied - self.forces
 
     @cached_property
     def energy(self):
@@ -501,6 +511,11 @@ class Mechanism(Shown):
         efforts = {name: _unit_along(self.E[:, i], rates) for i, name in enumerate(self.actuators)}
         return {name: unit for name, unit in efforts.items() if unit} | given
 
+    def _limits(self, limits):
+        """(low, high) by name."""
+        names = [*self.signals, *(f"multiplier_{name}" for name in self.constraints)]
+        return {n: interval(n, c, "limit") for n, c in by_name(limits, names, "signal", "The limits").items()}
+
     def _directions(self, actuators):
         columns = []
         for name, value in actuators.items():
@@ -599,7 +614,7 @@ def _part(identity, places):
     )
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
     part.shapes = {name: e for name, e in whole.shapes.items() if whole.places(e) <= places}
-    part.units, part.longer = whole.units, whole.longer
+    part.units, part.limits, part.longer = whole.units, whole.limits, whole.longer
     groups = {
         "coordinate": (q.names, part.q.names),
         "quasi-velocity": ((), ()) if q.plain else (q.velocity_names, part.q.velocity_names),

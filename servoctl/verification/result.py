@@ -59,6 +59,8 @@ class Verification(Detailed):
         Largest value of each number that passes.
     doubts : tuple of str
         What could not be checked, why, and what to do.
+    remarks : tuple of str
+        What else a reader should know, such as a first transient; the first of them is printed.
     """
 
     numbers: dict
@@ -66,6 +68,7 @@ class Verification(Detailed):
     notes: tuple = ()
     limits: dict = field(default_factory=dict)
     doubts: tuple = ()
+    remarks: tuple = ()
 
     @property
     def verdict(self):
@@ -78,7 +81,7 @@ class Verification(Detailed):
         return self.verdict == PASSED
 
     def _tables(self):
-        return [(CHECK, self.rows())], (*self.doubts, *self.notes)
+        return [(CHECK, self.rows())], (*self.remarks[:1], *self.doubts, *self.notes)
 
     def rows(self):
         """For each number its name, value, limit, whether it is "within" or "beyond" that, and what it is: texts."""
@@ -94,7 +97,7 @@ class Verification(Detailed):
         said = {FAILED: f"FAILED: {', '.join(self.failures)}"}.get(self.verdict, self.verdict)
         checks = [key for key in WORDS if key in self.numbers] + [key for key in residuals if full or key == worst]
         checks.sort(key=lambda key: key not in self.failures)  # what failed comes first
-        first = [f"  {text}" for text in (*self.doubts, *self.notes)]
+        first = [f"  {text}" for text in (*self.remarks[: None if full else 1], *self.doubts, *self.notes)]
         return [f"Verification: {said}", *first, *map(self._line, checks)]
 
     def _line(self, key):

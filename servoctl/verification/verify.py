@@ -20,6 +20,7 @@ from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
 from servoctl.values import frozen
 from servoctl.verification.between import AGREES, ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
+from servoctl.verification.remarks import of_loop, of_run
 from servoctl.verification.result import Verification, judged, largest, numbers
 
 LIMITS = {
@@ -84,7 +85,8 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     """
     segments = whole("segments", segments, least=1, most=MOST_SEGMENTS)
     if run is None and isinstance(model, Closed):
-        return verify_loop(model)
+        found = verify_loop(model)
+        return found if found.failures else replace(found, remarks=of_loop(model))
     model, run, faulty = _required(model, run)
     if faulty or not len(run.t):
         return judged({"samples": float(faulty or 1)}, {"samples": LIMITS["samples"]})
@@ -101,7 +103,8 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     }
     found |= {"segments": checks.segments()} if len(run.t) > 1 else {}
     limits = {key: checks.limit("residual" if key.startswith("residual ") else key) for key in found}
-    return judged(found, limits, checks.notes, checks.doubts)
+    said = judged(found, limits, checks.notes, checks.doubts)
+    return said if said.failures else replace(said, remarks=of_run(run))
 
 
 # --- what is verified
@@ -750,4 +753,3 @@ def _ratio(errors, sizes):
         return errors / sizes
     sizes = np.broadcast_to(sizes, np.shape(errors))
     return np.divide(errors, sizes, out=np.where(errors == 0, 0.0, np.inf), where=sizes > 0)
-

@@ -1,0 +1,71 @@
+"""A first transient: forces that decay from the first instant on because of what a start gives to free values."""
+
+import warnings
+
+import numpy as np
+
+from servoctl.errors import ServoError
+from servoctl.markup import digits
+from servoctl.model.start import without_rounding
+from servoctl.run import AGREES
+
+
+def first_transient(run, motion):
+    """What to say where a force begins above all its later peaks, with a start, found, that has none of it; else "".
+
+    `motion(start, span)` is the run of the same model from a state over a span (t0, t1) [s].
+    """
+    model, start, moves = run.model, run.start, run.jets[run.model.nq :, 0].any()  # at rest there is no transient
+    driven = model.reduction.mechanism.actuators and not model.ideal
+    if not (moves and driven and model.free and start and run.success and run.t[0] < run.t[-1]):
+        return ""
+    names, forces = run.signals("actuation")
+    sizes = np.abs(forces)
+    falls = [int(np.argmin(np.append(np.diff(size) < 0, False))) for size in sizes]
+    later, rounding = np.array([s[k:].max() for s, k in zip(sizes, falls, strict=True)]), AGREES * sizes.max()
+    a = int(np.argmax(sizes[:, 0] / (later + rounding)))
+    first, most = (digits(float(size), 4) for size in (forces[a, 0], later[a]))
+    if sizes[a, 0] <= later[a] + rounding or digits(sizes[a, 0], 3) == digits(later[a], 3):
+        return ""
+    values = ", ".join(f"{name} = {run[name][0]:.4g}" for name in start.held or start.free if name in run.names)
+    cause = f", as {values} {'was held' if start.held else 'was left free'}" * bool(values)
+    for state in _attracted(run, run.t[falls[a]], motion):
+        if call := _call(state, model, later + rounding):
+            told = f"{names[a]} has a first transient of {first} {run.unit(names[a])}".rstrip()
+            return f"{told} and is at most {most} later{cause}. Start without it: {call}"
+    return ""
+
+
+def _attracted(run, fallen, motion):
+    """Starts beside that of a run: a rest, and where motions that began earlier have come to by then.
+
+    They begin as long before as the run lasts, or as the transient does until it has `fallen` [s].
+    """
+    model, t0 = run.model, float(run.t[0])
+    known = dict(zip(model.state_names, run.jets[:, 0].tolist(), strict=False))
+    for length in (0.0, run.t[-1] - t0, fallen - t0):
+        guess = {name: value for name, value in known.items() if length or name in model.coordinate_names}
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                state = model.start(t0 - length, guess=guess)
+                x = motion(state, (state.t, t0)).jets[: len(known), -1] if length else state.values
+                yield model.start(t0, guess=dict(zip(known, without_rounding(x).tolist(), strict=True)))
+        except ServoError:
+            continue
+
+
+def _call(state, model, later):
+    """The call of a start by as few digits of its free values as serve; "" if a force is above its `later` peaks."""
+    for most in (4, 8, 16):
+        held = {name: float(f"{state[name]:.{most}g}") for name in state.free}
+        guess = {name: float(f"{state[name]:.4g}") for name in model.coordinate_names if name not in held}
+        try:
+            x = model.start(state.t, guess=guess, **held).values[:, None]
+        except ServoError:
+            continue
+        f = model.signals("actuation")[1]
+        forces = f.grid([state.t], model.with_highest([state.t], x)[: f.n_x], model.parameters)[:, 0]
+        if (np.abs(forces) <= later).all():
+            values = [f"t={state.t:g}"] * bool(state.t) + [f"{name}={value}" for name, value in held.items()]
+            return f"model.start({', '.join([*values, *[f'guess={guess}'] * bool(guess)])})"
+    return ""
