@@ -475,6 +475,7 @@ def along(model, last, cuts, x, size, names=(), instants=()):
     return moving
 
 
+@pytest.mark.usefixtures("c_compiler")
 @pytest.mark.parametrize("span", [(0.0, 12.0), (12.0, 0.0), (0.0, 0.05)], ids=str)
 @pytest.mark.parametrize("scale", [1.0, 1e6], ids=str)
 def test_deviations_moved_by_series_are_those_of_mathieus_equation(span, scale):
@@ -579,6 +580,7 @@ def test_propagators_that_shrink_beyond_rounding_are_multiplied_one_by_one():
     assert growth.quiet_by_series(model, run, 17)
 
 
+@pytest.mark.usefixtures("c_compiler")
 @pytest.mark.parametrize("span, t_eval", [((0.0, 10.0), None), ((10.0, 0.0), None), ((0.0, 10.0), [5.0, 10.0])], ids=str)
 def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_model, monkeypatch):
     """The wheel of Appell and Hamel turns back; its errors grow thirtyfold, but not exponentially."""

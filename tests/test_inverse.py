@@ -344,6 +344,7 @@ def test_the_method_of_the_verdict_by_hand_is_not_warned_about(recwarn):
     assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
 
 
+@pytest.mark.usefixtures("c_compiler")
 def test_limits_are_compared_with_a_method_by_hand():
     mechanism, program = gallery["passive-arm"].build()
     with warned("RadauIIA", "torque", "the limit is -5"):

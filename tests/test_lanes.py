@@ -100,6 +100,7 @@ int64_t in_use(void (*grid)(int64_t, const double *, const double *, const doubl
 """
 
 
+@pytest.mark.usefixtures("c_compiler")
 @pytest.mark.skipif("xgetbv1" not in compiler.features(), reason="the processor does not report registers in use")
 def test_a_grid_leaves_no_long_register_in_use():
     model, values = compiled(function(X2[0] * X2[1], X2[0] + T), "registers"), np.ones(128)

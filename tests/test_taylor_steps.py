@@ -306,6 +306,7 @@ ONE_CALL = {  # scene, span, samples
 }
 
 
+@pytest.mark.usefixtures("c_compiler")
 @pytest.mark.parametrize("case", ONE_CALL)
 def test_a_motion_in_one_call_is_that_by_inspected_steps(case, gallery_model, monkeypatch):
     name, span, times = ONE_CALL[case]
