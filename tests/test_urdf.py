@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import robots
-from refusals import refused
+from refusals import refused, warned
 
 import servoctl as sv
 
@@ -214,7 +214,8 @@ def test_limits_and_damping_reach_the_plant():
 
 def test_limits_of_zero_are_none():
     """Files of some exporters have effort="0" where nothing was stated."""
-    arm = sv.urdf(bar(inside='<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="0" velocity="0"/>'))
+    with warned("hinge"):
+        arm = sv.urdf(bar(inside='<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="0" velocity="0"/>'))
     assert (arm.effort, arm.velocity, arm.position) == ({}, {}, {"hinge": (-1.0, 1.0)})
 
 
