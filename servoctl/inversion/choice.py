@@ -153,7 +153,7 @@ class Request:
                 raise
             run = getattr(error, "run", None)
             judged = found if run is None else verdict(model, run)
-            if judged.dynamics == GROWS:
+            if judged.dynamics in (GROWS, HYPERBOLIC_ZEROS):
                 return self.relaxed(judged, begin, moving=True)
             if not (ranges and isinstance(error, SingularProgram)):
                 raise

@@ -9,7 +9,7 @@ import servoctl as sv
 from servoctl.codegen.compiler import once
 from servoctl.codegen.function import CALLS
 from servoctl.control.reference import resampled
-from servoctl.errors import ServoError
+from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.figures.animation import shows_mechanism
 from servoctl.figures.sheet import draw_sheet
 from servoctl.figures.style import write_png
@@ -134,6 +134,11 @@ def _planned(args, motion, report):
             window = Problem(model, span, start.values).window(method.window) if args.samples else span
             whole = replace(motion, span=span)
             return whole, *_simulate(whole, _options(args, model, window) | {"method": method})
+    except ServoError as error:
+        report.say(f"There is no {method} motion: {error}")
+        if not isinstance(error, (IntegrationStopped, SingularProgram)):
+            return motion, *_simulate(motion, options)
+    try:
         request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
         run = request.relaxed(found, start) if method else found and request.instead(model, start, found, forward[0])[1]
         if run is not None and args.samples:
@@ -142,7 +147,7 @@ def _planned(args, motion, report):
         if run is not None:
             return motion, run, ""
     except ServoError as error:
-        report.say(f"There is no {method or 'relaxed'} motion: {error}")
+        report.say(f"There is no relaxed motion: {error}")
     return motion, *(forward or _simulate(motion, options))
 
 
