@@ -21,6 +21,8 @@ def first_transient(run, motion):
         return ""
     names, forces = run.signals("actuation")
     sizes = np.abs(forces)
+    if not sizes.any():
+        return ""
     falls = [int(np.argmin(np.append(np.diff(size) < 0, False))) for size in sizes]
     later, rounding = np.array([s[k:].max() for s, k in zip(sizes, falls, strict=True)]), AGREES * sizes.max()
     a = int(np.argmax(sizes[:, 0] / (later + rounding)))

@@ -734,7 +734,17 @@ class Model(Detailed):
         return started(model, finite("t", t, "time"), held, guess, hold)
 
     def default_start(self, t=0.0):
-        """The start near the guess that `derive` received, without held values; errors as by `start`."""
+        """The start near the guess that `derive` received, without held values; errors as by `start`.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+
+        Returns
+        -------
+        State
+        """
         guess = self._store.specification[2] or {}
         return self.start(t, {name: value for name, value in guess.items() if name in self.state_names})
 

@@ -86,8 +86,8 @@ def started(model, t, held, guess, hold):
     except InconsistentStart as error:
         failure = error
     still = standstill(model, t, chosen)
-    determined = state is not None and not set(still.coordinates if still else ()) & set(state.free)
-    if still is not None and not hold and not determined:
+    open_ = set(still.coordinates if still else ()) - set(held)
+    if open_ and not hold and (state is None or open_ & set(state.free)):
         try:
             return _limit(model, t, held, chosen, still)
         except SingularProgram:  # without a limit a guess chooses

@@ -13,11 +13,10 @@ from servoctl.reduction.rows import Row
 from servoctl.tolerances import TINY
 
 NEWTON = 25  # steps
-AT_REST = 1e-9  # largest row at a rest, relative to its slopes times the state
+MET = 1e-9  # largest row at a rest, relative to its slopes times the state
 RANK = 1e-8  # singular values below this fraction of the largest count as zero
-ALIKE = 1e-3  # difference of two rests, or of their distances relative to these, that decides nothing
+UNDECIDED = 1e-3  # difference of two rests, or of their distances relative to these, that decides nothing
 GUESSED = 1e3  # weight of a guessed value relative to one without a guess
-SEED = 1788  # of the point at which angles are told apart
 
 
 class Rests:
@@ -73,7 +72,7 @@ class Rests:
         for _ in range(NEWTON):
             rows, slopes, off = (part[some] for part in self.measured(t, z, p))
             largest = float(np.nan_to_num(off, nan=np.inf).max(initial=0.0))
-            if not np.isfinite(slopes).all() or largest >= least <= AT_REST:
+            if not np.isfinite(slopes).all() or largest >= least <= MET:
                 break
             best, least = (z, largest) if largest < least else (best, least)
             z = z + self._step(rows, slopes, movable, weights)
@@ -81,7 +80,7 @@ class Rests:
         if not len(rows):
             return best, True, None
         worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
-        return best, least <= AT_REST, (self.names[np.arange(len(self.names))[some][worst]], float(rows[worst]))
+        return best, least <= MET, (self.names[np.arange(len(self.names))[some][worst]], float(rows[worst]))
 
     def _step(self, rows, slopes, movable, weights):
         """The least weighted step of the coordinates that the rows ask for, whatever the forces, and these forces."""
@@ -129,16 +128,16 @@ class Rests:
         """Whether rests differ by full turns only."""
         apart = (z - other)[: self.nq]
         apart -= self.angles * 2 * np.pi * np.round(apart / (2 * np.pi))
-        return bool(np.all(np.abs(apart) <= ALIKE * (1.0 + np.abs(other[: self.nq]))))
+        return bool(np.all(np.abs(apart) <= UNDECIDED * (1.0 + np.abs(other[: self.nq]))))
 
     def _angles(self, t, p, q):
         """Coordinates that a full turn leaves as they are, and another change does not."""
-        z = np.random.default_rng(SEED).uniform(-1.0, 1.0, self.function.size1_in(1))
+        z = np.random.default_rng(0).uniform(-1.0, 1.0, self.function.size1_in(1))
         z[: self.nq] += q
         turns = np.eye(len(z))[: self.nq] * 2 * np.pi
         changed = [[self.measured(t, z + part * turn, p)[0] for turn in turns] for part in (0.0, 1.0, 0.1)]
         whole, other = (np.abs(np.subtract(some, changed[0])).max(axis=1, initial=0.0) for some in changed[1:])
-        return whole < ALIKE * other
+        return whole < UNDECIDED * other
 
     def _met(self, t, p, q, known, movable):
         """q on the constraints and the program, moved by the actuators, by what nobody guessed, at last by anything."""
@@ -166,11 +165,11 @@ class Rests:
         away = [(z[: self.nq] - first) * sizes for z in found]
         lists = [[np.linalg.norm(a[some]) for a in away] for some in (known, self.angles & ~known, ~known)]
         guessed, turned, far = map(np.array, lists)
-        near = np.flatnonzero(_least(guessed))
-        left = near[_least(turned[near])]
+        near = np.flatnonzero(_smallest(guessed))
+        left = near[_smallest(turned[near])]
         heights = np.array([self._lifted(t, p, found[left[0]], found[i]) for i in left[1:]])
-        left = left[_least(np.append(0.0, heights))]
-        left = left[_least(far[left])]
+        left = left[_smallest(np.append(0.0, heights))]
+        left = left[_smallest(far[left])]
         return [found[left[0]], *(found[i] for i in near if i != left[0])]
 
     def _lifted(self, t, p, one, other):
@@ -183,9 +182,9 @@ class Rests:
         return work
 
 
-def _least(values):
+def _smallest(values):
     """Which values are the least, but for what decides nothing."""
-    return values - values.min() <= ALIKE * np.abs(values).max()
+    return values - values.min() <= UNDECIDED * np.abs(values).max()
 
 
 def _still(q, expressions):

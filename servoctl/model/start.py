@@ -208,14 +208,10 @@ def consistent(model, t, held, guess, hold):
 
 
 def _rests(model, t, aim, held, conditions):
-    """The equations, and the rest nearest to the guess before others like it, where a path begins at rest; else None.
-
-    A program without a path rests where nothing was guessed.
-    """
+    """The equations, and the rest nearest to the guess before others, where a path begins at rest; else None."""
     q, residuals = model.reduction.mechanism.q, model.reduction.program.residuals.values()
-    rates, guessed = held.keys() - set(q.names), (aim.weights > 1.0).any()
-    timed = any(ca.depends_on(e, q.t) for e in residuals)
-    if not residuals or guessed and not timed or any(held[name] for name in rates):
+    rates = held.keys() - set(q.names)
+    if not any(ca.depends_on(e, q.t) for e in residuals) or any(held[name] for name in rates):
         return None
     rests = model.once("rests", lambda: Rests.of_model(model))
     chosen = zip(q.names, aim.reference, (aim.weights > 1.0) | ~aim.movable, strict=False)
@@ -491,7 +487,7 @@ def _refuse(equations, aim, held, x):
         raise InconsistentStart(
             f"{change} = {held[change]:g} contradicts {what}.",
             "Held values satisfy every constraint and its time derivatives.",
-            nearest="" if nearest is None else f"{change} = {nearest:.9g}, beside the others.",
+            nearest="" if nearest is None else f"{change} = {nearest:.9g}.",
             do=f"Hold fewer values{', or pass this one in guess={...}' if change in aim.names else ''}.",
             held=change,
             value=float(held[change]),

@@ -283,7 +283,7 @@ class Mechanism(Shown):
         )  # fmt: skip
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
         driven.units, driven.limits = self.units, self.limits
-        driven.longer, driven.followers = self.longer, self.followers
+        driven.longer, driven.followers, driven.passive = self.longer, self.followers, self.passive
         return driven
 
     @property
@@ -613,6 +613,7 @@ def _part(identity, places):
         for rows in (whole.constraints, whole.followers)
     )
     part.outputs, part.inputs, part.reported = whole.outputs, whole.inputs, whole.reported
+    part.passive = whole.passive
     part.shapes = {name: e for name, e in whole.shapes.items() if whole.places(e) <= places}
     part.units, part.limits, part.longer = whole.units, whole.limits, whole.longer
     groups = {
