@@ -1,5 +1,7 @@
 """Plans and laws at the door: starts, edges of disturbances, quadratures, orders of optima, numbers that are none."""
 
+import itertools
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -219,6 +221,9 @@ def test_a_program_of_a_speed_has_the_inverse_of_its_place(damping):
     for name in ("F", "x", "theta"):
         assert np.abs(speed[name] - place[name]).max() < 1e-9 * np.abs(place[name]).max()
     assert sv.verify(speed.model, speed).passed
+    slopes = [sv.sensitivity(run.model, run, ("F", "theta"), ("m", "L")) for run in (speed, place)]
+    for pair in itertools.product(("F", "theta"), ("m", "L")):
+        assert np.abs(slopes[0][pair] - slopes[1][pair]).max() < 1e-8 * (0.01 + np.abs(slopes[1][pair]).max())
 
 
 def segway(by):

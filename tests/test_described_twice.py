@@ -328,7 +328,7 @@ def test_a_chain_a_tenth_of_a_millimetre_beside_its_plane_is_refused_with_its_ga
 
 @pytest.mark.parametrize("V", [np.eye(3), [[1, 0.5, 0], [0, 1, 0.2], [0, 0, 1]]])
 def test_the_constant_of_rolling_is_named_with_quasi_velocities(V):
-    """A ball of radius 0.2 m rolls under a body that stands on it."""
+    """A ball of radius 0.2 m rolls under a body that stands on it: where it has turned to is the constant."""
     plain = sv.coordinates("x phi a")
     x, phi, a = plain
     moved = plain.with_quasi_velocities("u v w", ca.DM(np.array(V)))
@@ -340,4 +340,4 @@ def test_the_constant_of_rolling_is_named_with_quasi_velocities(V):
     )  # fmt: skip
     path = sv.paths.rest_to_rest(plain.t, 0.0, 1.0, duration=2.0, smoothness=4)
     found = sv.report(sv.derive(m, sv.Program({"X": x - path})))
-    assert "0 is the constant of roll" in found.reason
+    assert "0 is the constant of phi" in found.reason

@@ -553,7 +553,7 @@ def test_output_redefinition_takes_an_equilibrium_beside_a_kink():
     assert [r.verdict for r in result.ranges] == ["stable"]
 
 
-# constants of constraints on velocities -------------------------------------------------------------------------------
+# constants of integrals, on which nothing depends ---------------------------------------------------------------------
 
 
 def ballbot(roll, gravity=9.81):
@@ -580,20 +580,19 @@ def on_coordinates(q):
 @pytest.mark.parametrize("gravity", [9.81, -9.81])
 def test_the_constant_of_a_rolling_constraint_is_named(gravity):
     written, integrated = verdict(ballbot(on_velocities, gravity)), verdict(ballbot(on_coordinates, gravity))
-    assert written.word == ("marginal" if gravity < 0 else "non-minimum phase")
-    assert "0 is the constant of roll" in written.reason and "coordinates" in written.do
-    assert integrated.word == ("marginal" if gravity < 0 else "non-minimum phase (hyperbolic)")
+    assert written.word == integrated.word == ("marginal" if gravity < 0 else "non-minimum phase (hyperbolic)")
+    assert "0 is the constant of phi, on which nothing depends" in written.reason
     assert "constant" not in integrated.reason
     others = [z for z in written.rest["start"].eigenvalues if abs(z) > 1e-6]
     assert others == pytest.approx(list(integrated.rest["start"].eigenvalues), abs=1e-6)
 
 
-def test_a_drift_that_no_constraint_explains_has_no_constant():
+def test_a_place_on_which_nothing_depends_is_named_and_stays_marginal():
     found = verdict(sv.derive(*beside(lambda x, y, v: -0.2 * v - x), keep=["y"]))
-    assert found.word == "marginal" and "constant" not in found.reason
+    assert found.word == "marginal" and "constant of y, on" in found.reason
     mechanism, _ = beside(lambda x, y, v: -0.2 * v)
     found = verdict(sv.derive(mechanism, sv.Program({"V": mechanism.q.d(1)[0]}), keep=["y"]))
-    assert found.word == "marginal" and "constant" not in found.reason
+    assert found.word == "marginal" and "constant of x, y, on" in found.reason
 
 
 def test_an_angle_of_90_degrees_has_no_cosine_of_1():
