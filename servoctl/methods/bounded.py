@@ -334,12 +334,13 @@ class FreeEntries:
         for _ in range(2 * LIFTED):
             x = x + self.local(self.times, x)[2].T
         A, size = self.local(self.times, x)[1], self.size[self.free]
-        A, Q = (A * size / size[:, None])[np.isfinite(A).all(axis=(1, 2))], np.eye(len(size))
+        A, Q, largest = (A * size / size[:, None])[np.isfinite(A).all(axis=(1, 2))], np.eye(len(size)), 0.0
         while len(A) and Q.shape[1]:
             _, s, directions = np.linalg.svd((Q.T @ A @ Q).reshape(-1, Q.shape[1]), full_matrices=False)
-            if s[-1] > CUTOFF * s[0]:
+            largest = largest or s[0]  # what is left may be rounding
+            if s[-1] > CUTOFF * largest:
                 break
-            Q = Q @ directions[s > CUTOFF * s[0]].T
+            Q = Q @ directions[s > CUTOFF * largest].T
         return Q
 
     def _scaled(self, A):
