@@ -170,7 +170,9 @@ class End:
         """The rest without its integrals, whose constants are eigenvalues 0; all of it if there is nothing else."""
         if self.others is None or not 0 < self.others.shape[1] < len(self.A):
             return self
-        A = self.others.T @ (self.A * self.size / self.size[:, None]) @ self.others
+        whole = self.A * self.size / self.size[:, None]
+        A = self.others.T @ whole @ self.others
+        A[np.abs(A) <= NOISE * np.abs(whole).max()] = 0.0  # rounding of all may be all that is left
         return End(self.t, self.x, A, np.ones(len(A)))
 
     @cached_property
@@ -334,13 +336,12 @@ class FreeEntries:
         for _ in range(2 * LIFTED):
             x = x + self.local(self.times, x)[2].T
         A, size = self.local(self.times, x)[1], self.size[self.free]
-        A, Q, largest = (A * size / size[:, None])[np.isfinite(A).all(axis=(1, 2))], np.eye(len(size)), 0.0
+        A, Q = (A * size / size[:, None])[np.isfinite(A).all(axis=(1, 2))], np.eye(len(size))
         while len(A) and Q.shape[1]:
             _, s, directions = np.linalg.svd((Q.T @ A @ Q).reshape(-1, Q.shape[1]), full_matrices=False)
-            largest = largest or s[0]  # what is left may be rounding
-            if s[-1] > CUTOFF * largest:
+            if s[-1] > CUTOFF * s[0]:
                 break
-            Q = Q @ directions[s > CUTOFF * largest].T
+            Q = Q @ directions[s > CUTOFF * s[0]].T
         return Q
 
     def _scaled(self, A):
