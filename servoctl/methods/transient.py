@@ -48,7 +48,8 @@ def _attracted(run, fallen, motion):
     for length in (0.0, run.t[-1] - t0, fallen - t0):
         guess = {name: value for name, value in known.items() if length or name in model.coordinate_names}
         try:
-            with warnings.catch_warnings(action="ignore"):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
                 state = model.start(t0 - length, guess=guess)
                 x = motion(state, (state.t, t0)).jets[: len(known), -1] if length else state.values
                 yield model.start(t0, guess=dict(zip(known, without_rounding(x).tolist(), strict=True)))
