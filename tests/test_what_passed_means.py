@@ -130,7 +130,8 @@ def lifted(times, **options):
 
 
 def remarks(model, start=None, span=(0.0, 4.0), **options):
-    with warnings.catch_warnings(action="ignore"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         run = sv.simulate(model, start or model.start(), span, **options)
     verification = sv.verify(model, run)
     assert verification.passed and len(repr(verification).splitlines()) <= 8
@@ -295,7 +296,8 @@ def test_the_command_takes_the_plan_that_the_inverse_takes(options, tmp_path):
     assert run.method in ("relaxed", "bounded") and (len(run.t) == 201 or not options)
     names = {}
     exec(SEGWAY, names)
-    with warnings.catch_warnings(action="ignore"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         assert sv.inverse(*names["scene"](), names["T_SPAN"]).method == run.method
 
 
