@@ -38,8 +38,10 @@ class Column(ca.SX):
 
     __setitem__ = None  # the symbols stay what they are
 
-    def __array_function__(self, func, types, args, kwargs):
-        return super().__array_function__(func, (ca.SX,), args, kwargs)  # CasADi knows its own types alone
+    if hasattr(ca.SX, "__array_function__"):  # from CasADi 3.8 on, which knows its own types alone
+
+        def __array_function__(self, func, types, args, kwargs):
+            return super().__array_function__(func, (ca.SX,), args, kwargs)
 
 
 class Coordinates:
@@ -84,7 +86,9 @@ class Coordinates:
         return self._q[self.names.index(named(name, self.names, "coordinate"))]
 
     def __SX__(self):
-        return self.jet(0)  # by which CasADi's functions take it
+        """The column by which CasADi's functions take it; one that is kept, as CasADi 3.7 does not."""
+        self.jet(0)
+        return self._columns[0]
 
     @property
     def T(self):
