@@ -186,7 +186,7 @@ def test_quasi_velocities_and_constraints_are_told_apart(derived):
 
 def test_the_key_holds_all_that_a_derivation_reads():
     told = {
-        "mechanism": {"q", "balance", "mass", "energy", "forces", "E", "actuators", "constraints", "outputs",
+        "mechanism": {"q", "balance", "mass", "energy", "forces", "followers", "E", "actuators", "constraints", "outputs",
                       "inputs", "reported", "parameters"},
         "program": {"residuals", "with_turns", "names", "by", "metric", "weights", "toward"},
     }  # fmt: skip

@@ -275,7 +275,7 @@ def test_a_plan_through_twelve_parameters_pushes_as_its_spline_does():
         (lambda: paths.rest_to_rest(T, 0, 1, 1.0, smoothness="C4"), ["smoothness='C4'"]),
         (lambda: paths.rest_to_rest(np.linspace(0, 1, 50), 0, 1, 1.0), ["t has 50 entries", "q.t", "casadi.Function"]),
         (lambda: paths.rest_to_rest(ca.MX.sym("t"), 0, 1, 1.0), ["t is a MX"]),
-        (lambda: paths.rest_to_rest(coordinates("x"), 0, 1, 1.0), ["t is a Coordinates"]),
+        (lambda: paths.rest_to_rest(coordinates("x y"), 0, 1, 1.0), ["t has 2 entries"]),
         (lambda: paths.trapezoid(T, 1, duration=2.0, ramp=1.5), ["1.5 s", "2 s", "A ramp of 1 s"]),
         (lambda: paths.trapezoid(T, 1, duration=2.0, ramp=1.0, smoothness=0), ["smoothness=0", "at least 1"]),
         (lambda: paths.circle(T, (0, 0), -1.0), ["radius = -1", "radius = 1"]),

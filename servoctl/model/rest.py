@@ -9,6 +9,7 @@ from contextlib import suppress
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import mapping
 from servoctl.errors import InconsistentStart, ServoError, SingularProgram
 from servoctl.jets.branches import shown
 from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
@@ -76,7 +77,7 @@ class Standstill:
 def started(model, t, held, guess, hold):
     """See `Model.start`: a consistent state, at a standstill the limit of the motion that follows."""
     state = failure = None
-    chosen = {**(guess or {}), **{name: value for name, value in held.items() if name in model.state_names}}
+    chosen = mapping(guess, "The guesses") | {name: v for name, v in held.items() if name in model.state_names}
     try:
         state = consistent(model, t, held, guess, hold)
         if _determined(model, state):
