@@ -24,10 +24,12 @@ from servoctl.inversion.verdict import (
     MARGINAL,
     MINIMUM,
     OPEN,
-    SINGULAR,
+    RELAXED,
     UNDETERMINED,
     Verdict,
+    chosen_by,
     verdict,
+    verdict_with,
 )
 from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
 from servoctl.methods.stability import warn
@@ -42,7 +44,6 @@ from servoctl.spec.program import Program
 from servoctl.values import frozen
 from servoctl.verification.remarks import path
 
-RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
 END_MOVES = "; its end is open, as the program moves there"
 END_SWINGS = "; its end is open, as modes on the imaginary axis swing on"
 DWELL = "Add a dwell before and after the path (a longer t_span)"
@@ -152,9 +153,9 @@ class Request:
             if model.ideal:
                 raise
             run = getattr(error, "run", None)
-            judged = found if run is None else verdict(model, run)
-            if judged.dynamics in (GROWS, HYPERBOLIC_ZEROS):
-                return self.relaxed(judged, begin, moving=True)
+            after = found if run is None else verdict(model, run)
+            if after.dynamics in (GROWS, HYPERBOLIC_ZEROS):
+                return self.relaxed(after, begin, moving=True)
             if not (ranges and isinstance(error, SingularProgram)):
                 raise
             # as at a rope without tension, which a bound excludes
@@ -162,18 +163,12 @@ class Request:
         excess = _excess(run, ranges)
         if excess:
             return self.relaxed(excess, begin)
-        found, instead = self.instead(model, begin, found, run)
-        if instead or found.dynamics != GROWS:
-            return instead or _with_reason(run, found)
-        warn(f"An ideal program has no other inverse, and this is {found}.")
-        return _with_reason(run, found)
-
-    def instead(self, model, begin, found, run):
-        """The verdict with a run, and the relaxed one in its place where it grows; None where it stays."""
-        moving = found.dynamics != MARGINAL
-        if found.dynamics == OPEN or run.status < 0 or run.internal.get("verdict") == "unstable":
-            found = verdict(model, run)
-        return found, None if found.dynamics != GROWS or model.ideal else self.relaxed(found, begin, moving)
+        after = verdict_with(model, found, run)
+        if after.dynamics == GROWS and not model.ideal:
+            return self.relaxed(after, begin, moving=found.dynamics != MARGINAL)
+        if after.dynamics == GROWS:
+            warn(f"An ideal program has no other inverse, and this is {after}.")
+        return _with_reason(run, after)
 
     def exact(self, model, begin, found, method):
         """The run of an exact inverse; integrated forward from the rest where the program begins, if there is one."""
@@ -266,14 +261,6 @@ def _begin(model, start, t):
 def _of_states(model, known):
     """Those of the known values that are states of the model."""
     return {name: value for name, value in known.items() if name in model.state_names}
-
-
-def chosen_by(model, found, weighted=False):
-    """The method of the exact inverse, None for the default of `simulate`, or `RELAXED`."""
-    if found.dynamics == HYPERBOLIC_ZEROS:
-        return Bounded()
-    relaxes = found.dynamics in (SINGULAR, GROWS) or weighted and found.dynamics == MARGINAL
-    return RELAXED if relaxes and not model.ideal else None
 
 
 def _by_hand(request, model, begin, found, chosen, method):

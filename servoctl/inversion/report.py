@@ -215,7 +215,7 @@ def report(
         Of a mechanism and its program the model is derived; where no actuation realises it, the report says so.
     run : Run, State or Program, optional
         A run, along which ranks, growth and actuation are reported; or a start; or the program of a mechanism. Default:
-        the start nearest to zero.
+        the start near the guess of `derive`.
     limits : dict of str to float or (float, float), optional
         Limits of actuators, as in `plant`: c means (-c, c).
 

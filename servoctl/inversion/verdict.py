@@ -11,6 +11,7 @@ import numpy as np
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.growth import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
+from servoctl.methods.choice import Bounded
 from servoctl.methods.kinks import SMOOTHER, kink, stays_on_kink
 from servoctl.model.model import Model
 from servoctl.model.start import State
@@ -22,6 +23,7 @@ from servoctl.values import frozen
 FLAT, MINIMUM, MARGINAL, SINGULAR = "flat", "minimum phase", "marginal", "singular at rest"
 HYPERBOLIC_ZEROS, GROWS = "non-minimum phase (hyperbolic)", "non-minimum phase"
 UNDETERMINED, UNREALISABLE, OPEN = "undetermined", "not realisable", "inconclusive"
+RELAXED = "relaxed"  # the word for the inverse that is no method of `simulate`
 LOOKS = 5  # instants before and after a path at which the program must stand still for its end to be a rest
 ASIDE = 0.25  # of the path's length: how far from it they lie
 NEAR = 0.1  # of the sizes of the free entries: distance within which a run begins or ends in an unstable rest
@@ -98,7 +100,7 @@ def verdict(model: Model, motion: Run | State | None = None) -> Verdict:
     ----------
     model : Model
     motion : Run or State, optional
-        A run, judged at its ends and along it, or a start. Default: the start nearest to zero.
+        A run, judged at its ends and along it, or a start. Default: the start near the guess of `derive`.
 
     Returns
     -------
@@ -113,6 +115,20 @@ def verdict(model: Model, motion: Run | State | None = None) -> Verdict:
     numbers = f"{len(actuators)} actuators ({', '.join(actuators)}), the program determines {len(program.residuals)}"
     reason = f"{numbers}, weights choose among them; then "
     return Verdict(UNDETERMINED, f"{reason}{found}", found.do, found.word, found.rest, found.internal)
+
+
+def verdict_with(model, found, run):
+    """The verdict found at a start; on its run where that decided nothing, the run stopped, or errors grow in it."""
+    decides = found.dynamics == OPEN or run.status < 0 or run.internal.get("verdict") == "unstable"
+    return verdict(model, run) if decides else found
+
+
+def chosen_by(model, found, weighted=False):
+    """The method of the exact inverse, None for the default of `simulate`, or `RELAXED`."""
+    if found.dynamics == HYPERBOLIC_ZEROS:
+        return Bounded()
+    relaxes = found.dynamics in (SINGULAR, GROWS) or weighted and found.dynamics == MARGINAL
+    return RELAXED if relaxes and not model.ideal else None
 
 
 def _of_motion(model, motion):
@@ -138,7 +154,7 @@ def _of_motion(model, motion):
 
 
 def _lost_at_default_start(model, t):
-    """As `_lost_rank`, of the start nearest to zero: a motion from elsewhere may have its rest there."""
+    """As `_lost_rank`, of the start near the guess of `derive`: a motion from elsewhere may have its rest there."""
     try:
         return _lost_rank(model, t, np.asarray(model.default_start(t).values, dtype=float))
     except ServoError:

@@ -173,6 +173,11 @@ class Aim:
     weights: np.ndarray
     movable: np.ndarray
 
+    @property
+    def guessed(self):
+        """Which values are guessed."""
+        return self.weights > 1.0
+
     @classmethod
     def of(cls, names, guess, held, identity):
         """The state nearest to guessed values, with held ones; where neither says more, to zero or the identity's."""
@@ -188,9 +193,9 @@ def consistent(model, t, held, guess, hold):
     n_x, states = len(model.state_names), model.state_names
     guess = {name: _known(model, name, value, states) for name, value in mapping(guess, "The guesses").items()}
     chosen = guess | values
-    names = JetEquations(model, t, conditions).names
-    q = model.reduction.mechanism.q
-    aim = Aim.of(names, guess, values, q.identity)
+    q, rows = model.reduction.mechanism.q, model.reduction.mechanism.followers | conditions
+    equations = JetEquations(model, t, rows)
+    aim = Aim.of(equations.names, guess, values, q.identity)
     for e in (list(places) for places, _ in q.spheres):
         if not aim.reference[e].any() and {*chosen} & {q.names[i] for i in e}:
             raise SpecificationError(
@@ -199,26 +204,25 @@ def consistent(model, t, held, guess, hold):
                 f"{next((q.names[i] for i in e if q.names[i] in q.identity), q.names[e[0]])} = 1.",
                 do="Guess another value, or leave all of them out.",
             )
-    rows, fixed = model.reduction.mechanism.followers | conditions, dict.fromkeys(conditions, 0.0) | held
-    equations, branches = _rests(model, t, aim, values, rows) or _solved(model, t, aim, rows, fixed)
+    found = _rests(model, equations, aim, values, rows)
+    equations, branches = found or _solved(model, equations, aim, rows, dict.fromkeys(conditions, 0.0) | held)
     x = branches[0]
     left = tuple(name for name in free_names(equations, x, aim, chosen) if name in states)
     fixed, residual = tuple(dict.fromkeys((*held, *conditions))), _largest(equations, x)
     return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x])
 
 
-def _rests(model, t, aim, held, conditions):
+def _rests(model, equations, aim, held, conditions):
     """The equations, and the rest nearest to the guess before others, where a path begins at rest; else None."""
-    q, residuals = model.reduction.mechanism.q, model.reduction.program.residuals.values()
+    t, q, residuals = equations.t, model.reduction.mechanism.q, model.reduction.program.residuals.values()
     rates = held.keys() - set(q.names)
     if not any(ca.depends_on(e, q.t) for e in residuals) or any(held[name] for name in rates):
         return None
     rests = model.once("rests", lambda: Rests.of_model(model))
-    chosen = zip(q.names, aim.reference, (aim.weights > 1.0) | ~aim.movable, strict=False)
+    chosen = zip(q.names, aim.reference, aim.guessed | ~aim.movable, strict=False)
     guess = {name: value for name, value, known in chosen if known}
     found, _ = rests.nearest(t, model.parameters, guess, held.keys() - rates)
     states = [np.concatenate([z[: q.nq], np.zeros(len(aim.names) - q.nq)]) for z in found]
-    equations = JetEquations(model, t, conditions)
     jets = np.append(states[0][: len(model.state_names)], np.zeros(model.n)) if states else None
     if states and not _largest(equations, states[0]) < TOLERANCE and model.strength(t, jets) <= RESOLVED:
         with suppress(ServoError):  # a pivot of the model vanishes there
@@ -269,9 +273,9 @@ def _known(model, name, value, names, what="state"):
     return finite(name, value)
 
 
-def _solve(model, t, aim, conditions):
+def _solve(model, equations, aim, conditions):
     """The start by the model's pivots, else by pivots chosen at the reference, else near the best state so far."""
-    equations, n_x = JetEquations(model, t, conditions), len(model.state_names)
+    t, n_x = equations.t, len(model.state_names)
     finite_there = np.all(np.isfinite(equations(aim.reference)[0][: equations.invariants]))
     x, residual = _best(equations, aim) if finite_there else (aim.reference, np.inf)
     blocks = model.reduction.cascade is not None
@@ -296,15 +300,13 @@ def _solve(model, t, aim, conditions):
     return equations, x, residual
 
 
-def _solved(model, t, aim, conditions, held):
+def _solved(model, equations, aim, conditions, held):
     """The equations, and the state nearest to the guess before others that the guess excludes no better."""
-    equations, x, residual = _solve(model, t, aim, conditions)
+    equations, x, residual = _solve(model, equations, aim, conditions)
     if not residual < TOLERANCE:
         _refuse(equations, aim, held, x)
-    guessed = aim.weights > 1.0
-    chosen = np.where(guessed | ~aim.movable)[0]
-    free = free_names(equations, x, aim, {aim.names[i] for i in chosen})
-    x = _at_guess(equations, x, aim, guessed & np.isin(aim.names, free))
+    free = free_names(equations, x, aim, {aim.names[i] for i in np.flatnonzero(aim.guessed)})
+    x = _at_guess(equations, x, aim, aim.guessed & np.isin(aim.names, free))
     sought = aim.movable & ~np.isin(aim.names, free)
     return equations, _branches(equations, x, replace(aim, movable=sought), model)
 
@@ -323,7 +325,7 @@ def _by_blocks(model, t, equations, aim):
 
 def _at_guess(equations, x, aim, guessed):
     """A consistent state with all guessed values, else with those (n_z,) among them that are free, else x."""
-    for kept in (aim.weights > 1.0, guessed):
+    for kept in (aim.guessed, guessed):
         first = np.where(kept, aim.reference, x)
         moved = gauss_newton(equations, first, replace(aim, movable=aim.movable & ~kept)) if kept.any() else x
         if _largest(equations, moved) < TOLERANCE:
@@ -334,9 +336,8 @@ def _at_guess(equations, x, aim, guessed):
 def _starts(equations, aim):
     """The reference, the nearest state with all guessed values, then points farther from the reference."""
     yield aim.reference
-    guessed = aim.movable & (aim.weights > 1.0)
-    if guessed.any():
-        yield gauss_newton(equations, aim.reference, replace(aim, movable=aim.movable & ~guessed))
+    if aim.guessed.any():
+        yield gauss_newton(equations, aim.reference, replace(aim, movable=aim.movable & ~aim.guessed))
     spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.sqrt(aim.weights)
     rng = np.random.default_rng(SEED)
     for attempt in range(1, TRIES):
@@ -345,12 +346,12 @@ def _starts(equations, aim):
 
 def _best(equations, aim):
     """The solution nearest to the guess and then to the reference, from two points, from others if it fails."""
-    found, guessed = [], aim.weights > 1.0
+    found = []
     for attempt, first in enumerate(_starts(equations, aim)):
         x = _nearest(equations, gauss_newton(equations, first, aim), aim)
-        residual, away = _largest(equations, x), np.linalg.norm((x - aim.reference)[guessed])
+        residual, away = _largest(equations, x), np.linalg.norm((x - aim.reference)[aim.guessed])
         found.append((0 if residual < TOLERANCE else residual, away, attempt, x))
-        if attempt >= guessed.any() and min(found)[0] == 0:
+        if attempt >= aim.guessed.any() and min(found)[0] == 0:
             break
     best = min(found)[-1]
     return best, _largest(equations, best)
@@ -448,7 +449,7 @@ def _branches(equations, x, aim, model):
         same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
         if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
             found.append(y)
-    away = [np.linalg.norm((y - aim.reference)[aim.weights > 1.0]) for y in found]
+    away = [np.linalg.norm((y - aim.reference)[aim.guessed]) for y in found]
     return np.array([found[i] for i in np.argsort(np.round(away, 9), kind="stable")])
 
 
@@ -459,7 +460,7 @@ def _clear_choice(x, y, aim, model):
     """
     differ = np.abs(y - x) > DISTINCT * (1.0 + np.abs(x))
     levels = np.maximum(0, np.arange(len(x)) - model.nq + model.n) // model.n
-    guessed = differ & (aim.weights > 1.0)
+    guessed = differ & aim.guessed
     lowest = guessed if guessed.any() else differ & (levels == levels[differ].min())
     between, way = (y - x)[lowest], (aim.reference - x)[lowest]
     return bool(way @ between < NEARER * (between @ between))

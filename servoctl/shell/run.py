@@ -13,8 +13,7 @@ from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.figures.animation import shows_mechanism
 from servoctl.figures.sheet import draw_sheet
 from servoctl.figures.style import write_png
-from servoctl.inversion.choice import Request, chosen_by
-from servoctl.inversion.verdict import verdict
+from servoctl.inversion.verdict import GROWS, MARGINAL, chosen_by, verdict, verdict_with
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded, as_drift, as_method, default_method
 from servoctl.methods.runge_kutta import ORDERS
@@ -139,12 +138,15 @@ def _planned(args, motion, report):
         if not isinstance(error, (IntegrationStopped, SingularProgram)):
             return motion, *_simulate(motion, options)
     try:
-        request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
-        run = request.relaxed(found, start) if method else found and request.instead(model, start, found, forward[0])[1]
-        if run is not None and args.samples:
-            run = resampled(run, np.array(options["t_eval"]))
-            run = replace(run, jets=run.model.with_highest(run.t, run.jets[: len(run.model.state_names)]))
-        if run is not None:
+        after = verdict_with(model, found, forward[0]) if found and forward else found
+        if method or after and after.dynamics == GROWS and not model.ideal:
+            from servoctl.inversion.choice import Request  # its import takes as long as a short motion
+
+            request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
+            run = request.relaxed(after, start, moving=not method and found.dynamics != MARGINAL)
+            if args.samples:
+                run = resampled(run, np.array(options["t_eval"]))
+                run = replace(run, jets=run.model.with_highest(run.t, run.jets[: len(run.model.state_names)]))
             return motion, run, ""
     except ServoError as error:
         report.say(f"There is no relaxed motion: {error}")

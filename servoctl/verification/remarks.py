@@ -73,16 +73,12 @@ def _past_limits(run, mechanism):
 
 def path(run, residual):
     """How far time moves a residual at the first state of a run, and the mean rate of its swings [rad/s], 0 without."""
-    q, p, k = (
-        run.model.reduction.mechanism.q,
-        run.model.reduction.mechanism.parameters,
-        run.model.reduction.mechanism.q.order(residual),
-    )
-    jets = np.zeros((q.nq + max(k, 0) * q.n, len(run.t)))
+    q, p = run.model.reduction.mechanism.q, run.model.reduction.mechanism.parameters
+    k = max(q.order(residual), 0)
+    jets = np.zeros((q.nq + k * q.n, len(run.t)))
     jets[: len(run.jets)] = run.jets[: len(jets), :1]
-    f = ca.Function(
-        "path", [q.t, ca.vertcat(*map(q.jet, range(max(k, 0) + 1))), ca.vertcat(*p.symbols)], [ca.densify(residual)]
-    )
+    arguments = q.t, ca.vertcat(*map(q.jet, range(k + 1))), ca.vertcat(*p.symbols)
+    f = ca.Function("path", arguments, [ca.densify(residual)])
     values = np.array(f(run.t[None], jets, run.model.parameters[: len(p.names)]))[0]
     change, size = np.diff(values), float(np.ptp(values))
     moves = np.flatnonzero(np.abs(change) > AGREES * size)
