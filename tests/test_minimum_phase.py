@@ -303,23 +303,7 @@ def test_units_do_not_matter(length):
     assert result.stable[0][1] / length == pytest.approx(1.0, abs=1e-10)
 
 
-# cost, printing, files ------------------------------------------------------------------------------------------------
-
-
-def test_the_cost_of_another_output_is_the_error_of_the_original_one(arm):
-    result = sv.minimum_phase(arm, "Gamma", (0, 1))
-    assert result.cost(0.3, (0.0, 2.0))["angle"] < 1e-9
-    other = arm.with_parameters(Gamma=0.2)
-    run = sv.simulate(other, other.start(), (0.0, 2.0))
-    assert result.cost(0.2, (0.0, 2.0))["angle"] == pytest.approx(0.1 * np.abs(run["q2"]).max(), rel=1e-6)
-    assert result.cost(0.35, (0.0, 2.0))["angle"] < result.cost(0.2, (0.0, 2.0))["angle"]
-
-
-def test_costs_of_unstable_values_are_refused(arm):
-    result = sv.minimum_phase(arm, "Gamma", (0, 1))
-    with refused(sv.UnstableInternalDynamics, "0.4", parameter="Gamma", value=0.5) as caught:
-        result.cost(0.5, (0.0, 2.0))
-    assert caught.value.details["eigenvalue"].real > 0
+# printing, files ------------------------------------------------------------------------------------------------
 
 
 def test_results_print_become_plain_and_are_drawn(arm, aircraft):
@@ -347,7 +331,7 @@ def test_bad_input(arm):
         sv.minimum_phase("arm", "Gamma", (0, 1))
     result = sv.minimum_phase(arm, "Gamma", (0, 1))
     for value in ("0.5", None, np.nan):
-        for call in (result.eigenvalues, result.lost, lambda v: result.cost(v, (0.0, 1.0))):
+        for call in (result.eigenvalues, result.lost):
             with refused(sv.SpecificationError, "Gamma"):
                 call(value)
 

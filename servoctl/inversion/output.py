@@ -11,18 +11,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import finite, interval, named, require_kind
-from servoctl.errors import (
-    InconsistentStart,
-    NotRealisable,
-    SingularProgram,
-    SpecificationError,
-    UnstableInternalDynamics,
-)
-from servoctl.inversion.zeros import AT_REST, NEWTON, NO_COEFFICIENT, ZeroPolynomial
+from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
+from servoctl.inversion.zeros import NO_COEFFICIENT, ZeroPolynomial
 from servoctl.methods.kinks import SMOOTHER, kink
 from servoctl.model.model import Model
 from servoctl.model.start import State
-from servoctl.simulation import simulate
+from servoctl.tolerances import ENTRY, TINY
 from servoctl.values import frozen
 
 VALUES = 257  # of the parameter, spread over its range, at which roots are computed
@@ -168,55 +162,6 @@ class MinimumPhase:
         model = polynomial.model.with_parameters(**{self.parameter: value})
         return _losses(model, polynomial.t, polynomial.equilibrium(value)[: model.nq])
 
-    def cost(self, value, t_span, **options):
-        """What following the output with this value costs in the output with the model's own value.
-
-        The motion with this value is integrated from its equilibrium, and the residuals of the model's own value are
-        evaluated along it. The redefined output follows its path exactly; these are the errors of the original one.
-
-        Parameters
-        ----------
-        value : float
-            Of the parameter, in a stable range.
-        t_span : (t0, t1)
-            [s]; the program must stand still at t0.
-        **options
-            Of `simulate`.
-
-        Returns
-        -------
-        dict of str to float
-            Largest magnitude of each residual, in its unit.
-
-        Raises
-        ------
-        UnstableInternalDynamics
-            If the internal dynamics with this value are not stable at the equilibrium.
-        """
-        value, polynomial = finite(self.parameter, value), self.polynomial
-        roots = self.eigenvalues(value)
-        if roots.size and not roots.real.max() < 0:
-            raise self._unstable(value, roots[0])
-        model = polynomial.model.with_parameters(**{self.parameter: value})
-        rest = dict(zip(model.coordinate_names, polynomial.equilibrium(value).tolist(), strict=False))
-        run = simulate(model, model.start(float(t_span[0]), guess=rest), t_span, **options)
-        return _residuals_along(polynomial.model, run)
-
-    def _unstable(self, value, root):
-        """The error of a value whose internal dynamics are not stable."""
-        ranges = " or ".join(f"{low:.6g} .. {high:.6g}" for low, high in self.stable)
-        number = f"{root.real:.6g}" if not root.imag else f"{root:.6g}"
-        return UnstableInternalDynamics(
-            f"With {self.parameter} = {value:g} the internal dynamics have the eigenvalue {number} 1/s.",
-            "The motion of a redefined output is integrated, for which its internal dynamics must be stable.",
-            nearest=f"{self.parameter} in {ranges}." if ranges else "",
-            do="Choose a value in a stable range, or follow the original output by method=sv.Bounded().",
-            parameter=self.parameter,
-            value=value,
-            eigenvalue=complex(root),
-            stable=self.stable,
-        )
-
     def as_dict(self):
         """The result as plain values: {name: value}."""
         return {
@@ -347,7 +292,7 @@ def _infinite(polynomial, grid):
     y[np.abs(y) <= NO_COEFFICIENT * np.abs(y).max()] = 0.0
     zeros = grid[y == 0].tolist()
     for i in np.flatnonzero(y[:-1] * y[1:] < 0):
-        zeros.append(brentq(f, grid[i], grid[i + 1], xtol=AT_REST**2, rtol=4 * np.finfo(float).eps))
+        zeros.append(brentq(f, grid[i], grid[i + 1], xtol=TINY, rtol=4 * np.finfo(float).eps))
     for i in np.flatnonzero((np.abs(y[1:-1]) <= np.minimum(np.abs(y[:-2]), np.abs(y[2:]))) & (y[:-2] * y[2:] > 0)) + 1:
         least = minimize_scalar(lambda value: abs(f(value)), bounds=(grid[i - 1], grid[i + 1]), method="bounded")
         if y[i] and least.fun <= TOUCHES * np.abs(y).max():
@@ -463,22 +408,10 @@ def _first_loss(at, q0, side):
 
 def _onto(at, x):
     """The rest nearest to a point."""
-    for _ in range(NEWTON):
+    for _ in range(BISECTIONS):
         rows, slopes, _ = at(x)
         change = np.linalg.lstsq(slopes, rows.ravel(), rcond=None)[0]
         x = x - change
-        if np.abs(change).max(initial=0.0) <= AT_REST * (1.0 + np.abs(x).max()):
+        if np.abs(change).max(initial=0.0) <= ENTRY * (1.0 + np.abs(x).max()):
             break
     return x
-
-
-def _residuals_along(model, run):
-    """Largest magnitudes of a model's residuals along a motion of another one."""
-    r, q = model.reduction, model.reduction.mechanism.q
-    residuals = ca.vertcat(*(r.original[name].expression for name in r.program.residuals))
-    jets = ca.vertcat(*(q.jet(k) for k in range(max(q.order(residuals), 0) + 1)))
-    p = ca.vertcat(*r.mechanism.parameters.symbols)
-    f = ca.Function("residuals", [q.t, jets, p], [ca.densify(residuals)])
-    parameters = np.tile(model.parameters[:, None], len(run.t))
-    values = np.array(f(run.t[None], run.jets[: jets.numel()], parameters))
-    return dict(zip(r.program.residuals, np.abs(values).max(axis=1).tolist(), strict=True))

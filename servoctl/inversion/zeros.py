@@ -15,13 +15,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable
+from servoctl.model.rests import Rests
 from servoctl.reduction.ranks import equilibrate
-from servoctl.tolerances import TINY
 
 NO_COEFFICIENT = 1e-11  # of the largest coefficient: a smaller one is zero
 ON_AXIS = 1e-10  # real part of a root, relative to its size or the usual one, below which it lies on the axis
 RADII = 4  # adjustments of the circle on which det Z is evaluated
-NEWTON, AT_REST = 50, 1e-12  # steps towards an equilibrium; its scaled residual
 MOVED = 1e-6  # distance of an equilibrium from the state that was passed, and its speed, relative to the state's size
 
 
@@ -39,9 +38,9 @@ class ZeroPolynomial:
     def __init__(self, model, parameter, at):
         self.model, self.parameter, self.t, self.nq = model, parameter, at.t, model.nq
         self.own = model.numbers[parameter]
-        self._rest, self._parts, self.degree = _equations(model)
+        self.rests, (self._rates, self._parts, self.degree) = Rests.of_model(model), _equations(model)
         self._values, self._ordered = {}, [self.own]  # of all with an equilibrium, ascending
-        self._known = {self.own: self._newton(self.own, self._balanced(at.values[: self.nq]))}
+        self._known = {self.own: self._rest(self.own, at.values[: self.nq])}
         self._require_equilibrium(at)
         self.low, self.high, self.radius, self._scales = 0, self.degree, 1.0, None
         self._adjust()
@@ -50,37 +49,17 @@ class ZeroPolynomial:
         names = list(self.model.numbers)
         return np.where(np.arange(len(names)) == names.index(self.parameter), value, self.model.parameters)
 
-    def _at_rest(self, z, value):
-        """What vanishes at rest (e,), its Jacobian in z = [q; μ] and its rate in time (e,), relative to their sizes."""
-        rows, slopes, rates = (np.array(part) for part in self._rest(self.t, z, self._numbers(value)))
-        sizes = np.maximum(np.abs(slopes) @ (1.0 + np.abs(z)), TINY)
-        return rows.ravel() / sizes, slopes / sizes[:, None], rates.ravel() / sizes
-
-    def _balanced(self, q):
-        """[q; μ] with the multipliers that balance a state at rest best."""
-        z = np.concatenate([q, np.zeros(self._rest.size1_in(1) - self.nq)])
-        rows, slopes, _ = self._at_rest(z, self.own)
-        z[self.nq :] = np.linalg.lstsq(slopes[:, self.nq :], -rows, rcond=None)[0]
-        return z
-
-    def _newton(self, value, z):
-        """[q; μ] of the equilibrium that Newton's method reaches."""
-        for _ in range(NEWTON):
-            rows, slopes, _ = self._at_rest(z, value)
-            if not np.isfinite(rows).all() or np.abs(rows).max(initial=0.0) < AT_REST:
-                break
-            scaled, left, right = (a.astype(float) for a in equilibrate(slopes))
-            z = z - right * np.linalg.lstsq(scaled, left * rows, rcond=AT_REST)[0]
-        worst = float(np.abs(rows).max(initial=0.0))
-        if not worst < AT_REST:
+    def _rest(self, value, q):
+        """[q; μ] of the equilibrium nearest to coordinates."""
+        z, there, worst = self.rests.reached(self.t, self._numbers(value), q)
+        if not there:
             raise InconsistentStart(
-                f"With {self.parameter} = {value:g} no equilibrium was reached: residuals at rest are up to "
-                f"{worst:.1e} of their terms.",
+                f"With {self.parameter} = {value:g} no equilibrium was reached: the {worst[0]} is {worst[1]:.1e} off.",
                 "Internal dynamics are linearised at an equilibrium of the program.",
                 do="Pass the state of another equilibrium, or a smaller range of values.",
                 parameter=self.parameter,
                 value=value,
-                residual=worst,
+                residual=worst[1],
             )
         return z
 
@@ -89,13 +68,13 @@ class ZeroPolynomial:
         z = self._known[self.own]
         q, size = z[: self.nq], 1.0 + np.abs(z[: self.nq]).max(initial=0.0)
         away, moving = np.abs(at.values[: self.nq] - q).max(), np.abs(at.values[self.nq :]).max(initial=0.0)
-        rate = np.abs(self._at_rest(z, self.own)[2]).max(initial=0.0)
+        rate = np.abs(self._rates(self.t, q, self._numbers(self.own))).max(initial=0.0)
         if max(away, moving) <= MOVED * size and rate <= MOVED:
             return
         nearest = dict(zip(self.model.coordinate_names, q.tolist(), strict=True))
         listed = ", ".join(f"{name} = {x:.6g}" for name, x in nearest.items())
         raise InconsistentStart(
-            f"At t = {self.t:g} s the program moves: its residuals change by {rate:.2g} of their terms per second."
+            f"At t = {self.t:g} s the program moves: its residuals change by {rate:.2g} per second."
             if rate > MOVED
             else f"The state at t = {self.t:g} s is no equilibrium: its coordinates are {away:.3g} off the nearest, "
             f"its velocities and accelerations up to {moving:.3g}.",
@@ -111,7 +90,7 @@ class ZeroPolynomial:
         if value not in self._known:
             place = bisect.bisect(self._ordered, value)
             nearest = min(self._ordered[max(0, place - 1) : place + 1], key=lambda known: abs(known - value))
-            self._known[value] = self._newton(value, self._known[nearest])
+            self._known[value] = self._rest(value, self._known[nearest][: self.nq])
             self._ordered.insert(place, value)
         return self._known[value]
 
@@ -195,7 +174,7 @@ class ZeroPolynomial:
 def _equations(model):
     """Functions of (t, z = [q; μ], p), and a bound of the degree.
 
-    The first gives what vanishes at rest, its Jacobian in z and its rate in t, the second Z_0, Z_1, ...
+    The first gives rates in t of constraints and program at rest by (t, q, p), the second Z_0, Z_1, ...
     """
     r, q = model.reduction, model.reduction.mechanism.q
     mu = ca.SX.sym("mu", r.realisation.B.shape[1])
@@ -209,7 +188,6 @@ def _equations(model):
     open_ = ca.SX(rows.numel(), mu.numel())
     parts += [ca.horzcat(ca.jacobian(rows, q.jet(j)), open_) for j in range(1, max(orders) + 1)]
     z, p = ca.vertcat(q.jet(0), mu), ca.vertcat(*r.mechanism.parameters.symbols)
-    still = ca.vertcat(ca.substitute(rows, *rest), *q.invariants.values())
-    at_rest = [ca.densify(e) for e in (still, ca.jacobian(still, z), ca.jacobian(still, q.t))]
+    rates = ca.densify(ca.substitute(ca.jacobian(rows[len(balance) :], q.t), *rest))
     matrices = [ca.densify(ca.substitute(part, *rest)) for part in parts]
-    return ca.Function("rest", [q.t, z, p], at_rest), ca.Function("Z", [q.t, z, p], matrices), sum(orders)
+    return ca.Function("rates", [q.t, q.jet(0), p], [rates]), ca.Function("Z", [q.t, z, p], matrices), sum(orders)
