@@ -124,6 +124,21 @@ def test_a_balance_with_gravity_or_damping_is_not_given_them_again():
         assert np.array(same(*numbers)) == pytest.approx(np.array(at(*numbers)), rel=1e-12)
 
 
+@pytest.mark.parametrize("factor, different", [(1.0, []), (2.0, ["d2x", "d2th"]), ("no coupling", ["d2x", "d2th"])])
+def test_a_kinetic_energy_beside_a_balance_has_its_inertia(factor, different):
+    q = sv.coordinates("x th")
+    (x, th), (dx, dth), (d2x, d2th) = q, q.d(1), q.d(2)
+    balance = [3 * d2x + ca.cos(th) * d2th - ca.sin(th) * dth**2, ca.cos(th) * d2x + d2th + 9.81 * ca.sin(th)]
+    kinetic = 1.5 * dx**2 + 0.5 * dth**2 + ca.cos(th) * dx * dth
+    kinetic = kinetic - ca.cos(th) * dx * dth if isinstance(factor, str) else factor * kinetic
+    options = {"kinetic": kinetic, "balance": balance, "actuators": {"f": x}}
+    if different:
+        with refused(sv.SpecificationError, components=different):
+            sv.Mechanism(q, **options)
+    else:
+        assert sv.Mechanism(q, **options).energy.is_scalar()
+
+
 @pytest.mark.parametrize("twice", [{"balance", "gibbs"}, {"gibbs", "mass"}, {"kinetic", "mass"}])
 def test_inertia_given_twice_is_refused(twice):
     q = sv.coordinates("x")

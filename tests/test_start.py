@@ -635,3 +635,43 @@ def test_a_printed_state_has_zeros_for_rounding_and_held_values_as_they_are():
     values, names = np.array([2.0, -1.8e-17, 1e-9, 1e-20]), ("x", "y", "z", "w")
     assert "x = 2, y = 0, z = 1e-09, w = 1e-20" in repr(State(0.0, values, names, ("w",), (), 0.0))
     assert "x = 2e-06, y = 0, z = 1e-15, w = 0" in repr(State(0.0, 1e-6 * values, names, (), (), 0.0))
+
+
+# what a start says of values that it was given -----------------------------------------------------------------------
+
+
+def on_a_circle():
+    """A bead that is driven round a circle of 1 m at 1 m/s."""
+    q = sv.coordinates("x y", units="m m")
+    (x, y), (dx, dy) = q, q.d(1)
+    ring = {"ring": x**2 + y**2 - 1}
+    bead = sv.Mechanism(q, sv.particle(q, 1.0, (x, y)), actuators={"drive": [-y, x]}, constraints=ring)
+    return sv.derive(bead, sv.Program({"speed": dx * y - dy * x - 1.0}))
+
+
+@pytest.mark.parametrize("held, parties, nearest", [
+    ({"x": 2.0}, ["ring"], 1.0), ({"x": 0.5, "y": 0.5}, ["y = 0.5", "ring"], np.sqrt(0.75)),
+    ({"x": 0.6, "dx": 0.7}, ["x = 0.6"], 0.8), ({"hold": (0.5, 0.6)}, ["a = 0", "b = 0"], 0.1),
+])  # fmt: skip
+def test_held_values_that_contradict_each_other_are_all_named(held, parties, nearest):
+    model = on_a_circle()
+    x = model.reduction.mechanism.q["x"]
+    if "hold" in held:
+        held = {"hold": {name: x - value for name, value in zip("ab", held["hold"], strict=True)}}
+    with refused(sv.InconsistentStart, *parties) as caught:
+        model.start(**held)
+    assert caught.value.details["nearest_value"] == pytest.approx(nearest, abs=1e-9)
+
+
+def test_a_guess_that_no_state_is_near_is_printed_with_its_distance():
+    model = on_a_circle()
+    assert "guess" not in str(model.start(guess={"x": 0.6, "y": 0.8}))
+    start = model.start(guess={"x": 10.0, "y": 5.0})
+    assert start["x"] / start["y"] == pytest.approx(2.0)
+    assert "9.106 off: x = 0.8944, guessed 10" in str(start)
+
+
+def test_an_angle_that_looks_like_degrees_is_printed_in_radians():
+    model = sv.derive(*gallery["pendubot"].build())
+    assert "90 degrees are 1.571" in str(model.start(guess={"q1": 90.0}))
+    assert "degrees" not in str(model.start(guess={"q1": 2.5}))

@@ -80,11 +80,13 @@ def started(model, t, held, guess, hold):
     chosen = mapping(guess, "The guesses") | {name: v for name, v in held.items() if name in model.state_names}
     try:
         state = consistent(model, t, held, guess, hold)
-        if _determined(model, state):
+        if _determined(model, t, state.values):
             if _faint(model, t, state.values):
                 raise _division(model, t, state.values, chosen, FAINT)
             return state
     except InconsistentStart as error:
+        if held and _determined(model, t, _at_rest(model, t, chosen)[-1]):
+            raise
         failure = error
     still = standstill(model, t, chosen)
     open_ = set(still.coordinates if still else ()) - set(held)
@@ -175,9 +177,9 @@ def _later(model, t):
     return [t + tau * length for tau in LATER]
 
 
-def _determined(model, state):
+def _determined(model, t, x):
     """Whether the invariants leave as many values free at a state as elsewhere."""
-    jacobian = JetEquations(model, state.t, {})(state.values)[1]
+    jacobian = JetEquations(model, t, {})(x)[1]
     if not np.all(np.isfinite(jacobian)):
         return False
     sizes = np.linalg.svd(equilibrate(jacobian)[0].astype(float), compute_uv=False)
@@ -310,7 +312,7 @@ def _moves(model, t, guess, still):
     q = model.reduction.mechanism.q
     measured = [name not in still.coordinates for name in q.names]
     speed = np.abs(_state_rates(model, state.t, state.values)[measured]).max(initial=0.0)
-    return bool(speed > MOVES * (1.0 + np.abs(state.values[: q.nq]).max())) and _determined(model, state)
+    return bool(speed > MOVES * (1.0 + np.abs(state.values[: q.nq]).max())) and _determined(model, state.t, state.values)
 
 
 def _state_rates(model, t, x):

@@ -57,6 +57,8 @@ class State(Value, Shown):
     branches : (b, n_x) array
         This state and others with the same held and free values that a short search found, between which neither
         the guess nor the distance from zero decides.
+    notes : tuple of str
+        On values that no such state has, and on angles that look like degrees.
     """
 
     t: float
@@ -67,6 +69,7 @@ class State(Value, Shown):
     residual: float
     at_rest: tuple = ()
     branches: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
+    notes: tuple = field(default=(), compare=False)
 
     def __getitem__(self, name):
         named(name, self.names, "state")
@@ -86,6 +89,7 @@ class State(Value, Shown):
                 else ""
             )
             + self._told_apart()
+            + "".join(f"\n  {note}" for note in self.notes)
         )
 
     def _told_apart(self):
@@ -209,7 +213,19 @@ def consistent(model, t, held, guess, hold):
     x = branches[0]
     left = tuple(name for name in free_names(equations, x, aim, chosen) if name in states)
     fixed, residual = tuple(dict.fromkeys((*held, *conditions))), _largest(equations, x)
-    return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x])
+    notes = tuple(_notes(chosen, guess, dict(zip(states, x.tolist(), strict=False)), q.units))
+    return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x], notes=notes)
+
+
+def _notes(given, guess, state, units):
+    """On the guessed value that a state is farthest from, and on given angles that are whole turns in degrees."""
+    away = {abs(state[name] - value): name for name, value in guess.items()}
+    if away and max(away) > DISTINCT * (1.0 + np.abs([*state.values()]).max()):
+        name = away[max(away)]
+        yield f"nearest to the guess, {max(away):.4g} off: {name} = {state[name]:.4g}, guessed {guess[name]:.4g}"
+    for name, value in given.items():
+        if units.get(name) == "rad" and abs(value) > 2 * np.pi and value % 5 == 0:
+            yield f"{name} = {value:g} is in radians; {value:g} degrees are {np.radians(value):.4g}"
 
 
 def _rests(model, equations, aim, held, conditions):
@@ -481,10 +497,12 @@ def _refuse(equations, aim, held, x):
     alone = equations.without([name for name in held if name not in aim.names])
     all_movable = replace(aim, movable=np.ones(len(aim.names), dtype=bool))
     if held and _loosened(alone, all_movable, x)[1] < TOLERANCE:
-        change, nearest = _nearest_held(equations, aim, held, x)
+        loosened = _loosened_values(equations, aim, held, x) or {next(iter(held)): None}
+        (change, nearest), *others = loosened.items()
         largest, worst = max(zip(residuals, equations.rows, strict=True))
-        by_others = "the constraints together with the other held values"
-        what = f"the invariant {worst!r} (residual {largest:.2e})" if worst in alone.rows else by_others
+        what = [f"{name} = {held[name]:g}" for name, _ in others]
+        what += [f"the invariant {worst!r} (residual {largest:.2e})"] if worst in alone.rows else []
+        what = " and ".join(what) or f"the constraints with {', '.join(name for name in held if name != change)} held"
         raise InconsistentStart(
             f"{change} = {held[change]:g} contradicts {what}.",
             "Held values satisfy every constraint and its time derivatives.",
@@ -506,20 +524,17 @@ def _loosened(equations, aim, x):
     return y, _largest(equations, y)
 
 
-def _nearest_held(equations, aim, held, x):
-    """The held value whose least relative change agrees with the others, and that value, None where none does."""
-    change, nearest, least = next(iter(held)), None, np.inf
+def _loosened_values(equations, aim, held, x):
+    """Held values, each of which agrees with the others when it alone changes, as changed so; the least change first."""
+    found = {}
     for name, value in held.items():
         loose = replace(aim, movable=aim.movable | np.isin(aim.names, name))
         y, residual = _loosened(equations.without([name]), loose, x)
-        if not residual < TOLERANCE:
-            continue
-        is_state = name in aim.names
-        other = y[aim.names.index(name)] if is_state else value + equations(y)[0][equations.rows.index(name)]
-        if abs(other - value) / (1.0 + abs(value)) < least:
-            change, least = name, abs(other - value) / (1.0 + abs(value))
-            nearest = float(other) if abs(other) > TOLERANCE * abs(value) else 0.0
-    return change, nearest
+        if residual < TOLERANCE:
+            is_state = name in aim.names
+            other = y[aim.names.index(name)] if is_state else value + equations(y)[0][equations.rows.index(name)]
+            found[name] = float(other) if abs(other) > TOLERANCE * abs(value) else 0.0
+    return dict(sorted(found.items(), key=lambda item: abs(item[1] - held[item[0]]) / (1.0 + abs(held[item[0]]))))
 
 
 def _not_found(equations, x, residuals):

@@ -348,13 +348,17 @@ class Mechanism(Shown):
                 source="balance" if self._gibbs is None else "gibbs",
             )  # fmt: skip
         self._refuse_asymmetry()
-        if self._gibbs is not None and self._kinetic is not None:
-            difference = ca.gradient(self._gibbs, acceleration) - lagrange(self.q, self._kinetic)
-            components = zip(self.q.jet_names(2), difference.elements(), strict=True)
-            different = [name for name, component in components if not self.is_zero([component])]
-            if different:
+        if self._kinetic is not None and given:
+            w, what = ca.vertcat(*self.q.gamma(1)), "Gibbs function" if self._inverse_dynamics is None else "balance"
+            if self._gibbs is not None:
+                both = ca.gradient(self._gibbs, acceleration), lagrange(self.q, self._kinetic)
+            else:  # a balance may contain other loads
+                slopes = ca.gradient(self._kinetic, w)
+                both = ca.jtimes(self._inverse_dynamics, acceleration, w), ca.jtimes(slopes, w, w)
+            couples = list(zip(*(side.elements() for side in both), strict=True))
+            if different := self._different(couples, self.q.jet_names(2)):
                 raise SpecificationError(
-                    f"The Gibbs function and the kinetic energy give different balances in {', '.join(different)}.",
+                    f"The {what} and the kinetic energy give different inertial forces in {', '.join(different)}.",
                     "Both describe the same inertia: ∂S/∂γ'' = Vᵀ(d/dt ∂T/∂q' - ∂T/∂q).",
                     do="Correct one of them, or remove it.",
                     components=different,
