@@ -311,8 +311,9 @@ def _moves(model, t, guess, still):
         return False
     q = model.reduction.mechanism.q
     measured = [name not in still.coordinates for name in q.names]
-    speed = np.abs(_state_rates(model, state.t, state.values)[measured]).max(initial=0.0)
-    return bool(speed > MOVES * (1.0 + np.abs(state.values[: q.nq]).max())) and _determined(model, state.t, state.values)
+    t, x = state.t, state.values
+    speed = np.abs(_state_rates(model, t, x)[measured]).max(initial=0.0)
+    return bool(speed > MOVES * (1.0 + np.abs(x[: q.nq]).max())) and _determined(model, t, x)
 
 
 def _state_rates(model, t, x):

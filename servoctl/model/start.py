@@ -525,7 +525,7 @@ def _loosened(equations, aim, x):
 
 
 def _loosened_values(equations, aim, held, x):
-    """Held values, each of which agrees with the others when it alone changes, as changed so; the least change first."""
+    """Held values, each as it agrees with the others when it alone changes, the least change first."""
     found = {}
     for name, value in held.items():
         loose = replace(aim, movable=aim.movable | np.isin(aim.names, name))
