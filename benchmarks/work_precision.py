@@ -47,8 +47,8 @@ Measured on {processor}, {cores} cores, {system}, compiler {compiler}, with othe
 
 `sv.simulate` follows from this: each instant solved where nothing is integrated; else the Taylor method, and Radau IIA
 where a hundred steps show that stability limits those of a series, which the run's message then says. DOP853 takes its
-place with poles and minimal coordinates, which series exclude, where pivots change along the motion, as each choice of
-them has a series of its own, and where the rates have more than 300 operations, as making a series takes seconds.
+place with poles, which series exclude, where pivots change along the motion, as each choice of them has a series of
+its own, and where the rates have more than 300 operations, as making a series takes seconds.
 `accuracy=1e-6` adds projection and a tolerance that is lowered until two motions agree to the accuracy.
 
 ## The fastest setting for an error

@@ -44,12 +44,10 @@ from servoctl.inversion.report import report as report
 from servoctl.methods.choice import Adaptive as Adaptive
 from servoctl.methods.choice import Algebraic as Algebraic
 from servoctl.methods.choice import Bounded as Bounded
-from servoctl.methods.choice import MinimalCoordinates as MinimalCoordinates
 from servoctl.methods.choice import Poles as Poles
 from servoctl.methods.choice import Project as Project
 from servoctl.methods.choice import RadauIIA as RadauIIA
 from servoctl.methods.choice import RungeKutta as RungeKutta
-from servoctl.methods.choice import Sundials as Sundials
 from servoctl.methods.choice import Taylor as Taylor
 from servoctl.methods.events import Event as Event
 from servoctl.methods.stability import sampled_bound as sampled_bound

@@ -23,16 +23,15 @@ from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded
 from servoctl.methods.choice import (
     EXPLICIT,
+    ORDERS,
     Adaptive,
     Algebraic,
     Bounded,
     Method,
-    MinimalCoordinates,
     Poles,
     Project,
     RadauIIA,
     RungeKutta,
-    Sundials,
     Taylor,
     as_drift,
     as_method,
@@ -44,11 +43,10 @@ from servoctl.methods.events import Event, Events, as_events, occurrences
 from servoctl.methods.motion import DEFAULT_SAMPLES, breakpoints, margin_at, without_interruption
 from servoctl.methods.orders import end_at_other_orders
 from servoctl.methods.radau import RadauSteps
-from servoctl.methods.runge_kutta import ORDERS, RungeKuttaSteps
+from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.stability import run_checked, warn, warn_drifted, warn_many_steps, warn_unstable
-from servoctl.methods.sundials import SundialsSteps
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
 from servoctl.model.model import Model
@@ -75,7 +73,7 @@ def simulate(
     method: Method | str | None = None,
     *,
     inputs: Mapping[str, object] | None = None,
-    drift: Project | Poles | MinimalCoordinates | str | float | None = None,
+    drift: Project | Poles | str | float | None = None,
     accuracy: float | None = None,
     t_eval: ArrayLike | None = None,
     events: Mapping[str, object] | Sequence[object] | Event | Callable[..., float] | str | None = None,
@@ -92,15 +90,14 @@ def simulate(
         From `model.start`; for a plant (q, γ'), also by name.
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
-    method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, Sundials, or a short form, optional
+    method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, or a short form, optional
         A method with its settings, such as `sv.Taylor(jets=3)` or `sv.RungeKutta(4, step=1e-3)`, or the short form of
-        a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK1" to "RK8", scipy's names, "CVODES" or
-        "IDAS". Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
+        a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK4", "RK8", or scipy's names.
+        Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
         Σ o_a = 0, else "Taylor", or "RadauIIA" where stability limits its steps; "DOP853" with the treatments of drift
         that series exclude, and for equations so large that making a series takes seconds.
-    drift : None, "project", "minimal", float, `Project(...)`, `Poles(...)` or `MinimalCoordinates()`, optional
-        Treatment of constraint drift. A number is the time constant of the error dynamics [s]. "minimal" integrates
-        as many values as the program leaves free and solves for the others: exact, in Python, at many times the cost.
+    drift : None, "project", float, `Project(...)` or `Poles(...)`, optional
+        Treatment of constraint drift. A number is the time constant of the error dynamics [s].
     accuracy : float, optional
         Largest error of the motion, relative to each component's size. It determines method and drift
         (`servoctl.methods.accuracy`), and the error is measured. Only `method=sv.Taylor(jets=3)` may be combined
@@ -431,10 +428,8 @@ def _stepping(model, method, drift, span, bar, atol):
             return RadauSteps(model, drift, rtol, given or least, order, step, bar)
         case RungeKutta(_, step):
             return RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
-        case Sundials(name, rtol, given):
-            return SundialsSteps(model, name, drift, rtol, given or least, t1 - t0, bar)
         case Adaptive(name, rtol, given):
-            each = least if atol is None or isinstance(drift, MinimalCoordinates) else atol
+            each = least if atol is None else atol
             return ScipySteps(model, name, drift, rtol, given or each, bar)
 
 

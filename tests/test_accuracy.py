@@ -48,7 +48,7 @@ def test_the_motion_is_as_accurate_as_asked(name, accuracy, independent):
     assert run.method == "Taylor" and "two tolerances agree" in run.message
     assert rule.motion_error(model, run.jets, exact.jets) <= accuracy
     coarse = sv.simulate(
-        model, start, gallery[name].t_span, sv.Adaptive("RK23", rtol=1e-2, atol=1e-2), t_eval=times(gallery[name])
+        model, start, gallery[name].t_span, sv.Adaptive("RK45", rtol=1e-2, atol=1e-2), t_eval=times(gallery[name])
     )
     assert rule.motion_error(model, coarse.jets, exact.jets) > 1e-9  # the measure tells a coarse motion
 

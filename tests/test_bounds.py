@@ -51,7 +51,7 @@ def test_a_bound_of_something_else_is_refused(given):
         bounds.sampled_bound(**given)
 
 
-REAL_LIMITS = {"RK1": 2.0, "RK2": 2.0, "RK4": 2.785293563405, "RK5": 3.306567892635, "RK23": 2.512745326618}
+REAL_LIMITS = {"RK4": 2.785293563405, "RK45": 3.306567892635}
 
 
 @pytest.mark.parametrize("method", REAL_LIMITS)
@@ -60,8 +60,8 @@ def test_real_limits_are_the_known_ones(method):
 
 
 def test_imaginary_limits_are_the_known_ones():
-    limits = {method: bounds.largest_explicit(method, None, np.pi / 2) for method in ("RK1", "RK2", "RK23", "RK4")}
-    assert limits == pytest.approx({"RK1": 0.0, "RK2": 0.0, "RK23": np.sqrt(3), "RK4": np.sqrt(8)}, abs=1e-9)
+    limits = {method: bounds.largest_explicit(method, None, np.pi / 2) for method in ("RK4", "RK45")}
+    assert limits["RK4"] == pytest.approx(np.sqrt(8), abs=1e-9) and 0 < limits["RK45"] < 1
 
 
 @pytest.mark.parametrize("direction", [np.pi, 0.75 * np.pi, 0.5 * np.pi])
@@ -90,8 +90,8 @@ def test_the_stability_function_is_the_exponential_to_the_order(method):
 
 
 def test_multistep_methods_and_idle_orders_are_refused():
-    with refused(sv.NameUnknown, name="BDF"):
-        bounds.stability_function("BDF")
+    with refused(sv.NameUnknown, name="LSODA"):
+        bounds.stability_function("LSODA")
     with refused(sv.SpecificationError, "order", "Taylor"):
         bounds.stability_function("Taylor")
     for given in (("RK4", 4), ("RadauIIA", 4), ("RadauIIA", None), ("Taylor", 0)):
@@ -148,8 +148,8 @@ def test_complex_poles_are_judged_in_their_own_direction(sine):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sv.simulate(sine, sine.start(), (0.0, 1.0), sv.RungeKutta(4, step=0.05), drift=sv.Poles(pair))
-    with warned("RK2"):
-        sv.simulate(sine, sine.start(), (0.0, 1.0), sv.RungeKutta(2, step=0.05), drift=sv.Poles(pair))
+    with warned("RK4"):
+        sv.simulate(sine, sine.start(), (0.0, 1.0), sv.RungeKutta(4, step=0.06), drift=sv.Poles(pair))
 
 
 def test_no_choice_within_the_bound_is_warned_about(sine):
@@ -160,7 +160,7 @@ def test_no_choice_within_the_bound_is_warned_about(sine):
         assert sine_error(sine, 55.0) < 1.0
 
 
-@pytest.mark.parametrize(("method", "step"), [("RK1", 0.1), ("RK4", 0.05), ("RK8", 0.1), ("RK4", 0.02)])
+@pytest.mark.parametrize(("method", "step"), [("RK4", 0.05), ("RK8", 0.1), ("RK4", 0.02)])
 def test_steps_too_long_for_the_internal_dynamics_are_warned_about(method, step, c_compiler):
     model = sv.derive(*mass_on_car(damping=1000.0))
     start = model.start(s=0.0, ds=0.0)

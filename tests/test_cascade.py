@@ -236,7 +236,7 @@ def test_a_function_of_the_state_takes_what_is_not_replaced_from_it():
 
 
 @pytest.mark.parametrize("name", ["last damper", "first damper"])
-@pytest.mark.parametrize("method", ["Taylor", "RadauIIA", "CVODES", "IDAS"])
+@pytest.mark.parametrize("method", ["Taylor", "RadauIIA"])
 def test_integrators_agree(name, method, pairs):
     model = pairs(name)[0]
     assert moved(model, method)["force"] == pytest.approx(moved(model)["force"], rel=1e-6)

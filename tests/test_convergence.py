@@ -87,10 +87,7 @@ def rod():
 # orders, ladders, work -----------------------------------------------------------------------------------------------
 
 STEPS = {
-    "RK1": (400, 800, 1600, 3200),
-    "RK2": (100, 200, 400, 800),
     "RK4": (25, 50, 100, 200),
-    "RK5": (25, 50, 100, 200),
     "RK8": (10, 15, 20, 30),
 }
 
@@ -101,17 +98,17 @@ def test_fixed_step_methods_have_their_order(name, method, case):
     errors = [case[name].error(case[name].run(method, step=2.0 / n)) for n in STEPS[method]]
     slope = -np.polyfit(np.log(STEPS[method]), np.log(errors), 1)[0]
     order = int(method[2:])
-    assert abs(slope - order) < {1: 0.05, 2: 0.05, 4: 0.15}.get(order, 0.6)
+    assert abs(slope - order) < {4: 0.15, 8: 0.6}[order]
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau", "RK45", "BDF"])
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "RK45"])
 @pytest.mark.parametrize("name", ["appell-hamel", "pendulum"])
 def test_tolerance_ladders_are_monotone(name, method, case):
     rungs = [1e-4, 1e-6, 1e-8, 1e-10]
     runs = [case[name].run(method, rtol=rtol, atol=1e-2 * rtol, t_eval=[0.0, 2.0]) for rtol in rungs]
     errors = [case[name].error(run) for run in runs]
     assert all(fine < 0.5 * coarse for coarse, fine in zip(errors[:-1], errors[1:], strict=True))
-    assert errors[-1] < {"BDF": 1e-8, "RK45": 1e-9}.get(method, 5e-11)
+    assert errors[-1] < {"RK45": 1e-9}.get(method, 5e-11)
     work = [run.counters["nfev"] for run in runs]
     assert all(fine > coarse for coarse, fine in zip(work[:-1], work[1:], strict=True))
 
@@ -123,8 +120,8 @@ def test_series_reach_rounding_at_any_order(order, case):
 
 
 CEILINGS = {  # evaluations for 2 s at rtol = 1e-9; measured, and a quarter more
-    "appell-hamel": {"RK45": 500, "DOP853": 240, "Radau": 2800, "BDF": 480, "LSODA": 240, "Taylor": 15},
-    "pendulum": {"RK45": 800, "DOP853": 490, "Radau": 2800, "BDF": 700, "LSODA": 370, "Taylor": 27},
+    "appell-hamel": {"RK45": 500, "DOP853": 240, "Radau": 2800, "LSODA": 240, "Taylor": 15},
+    "pendulum": {"RK45": 800, "DOP853": 490, "Radau": 2800, "LSODA": 370, "Taylor": 27},
 }
 
 
@@ -133,7 +130,7 @@ def test_evaluations_at_1e_9(name, method, case):
     run = case[name].run(method, rtol=1e-9, t_eval=[0.0, 2.0])
     assert 0 < run.counters["nfev"] <= CEILINGS[name][method]
     assert case[name].error(run) < 1e-6
-    if method in ("Radau", "BDF"):
+    if method == "Radau":
         assert run.counters["njev"] > 0 and run.counters["nlu"] > 0
 
 

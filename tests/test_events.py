@@ -8,7 +8,7 @@ from refusals import refused
 import servoctl as sv
 from servoctl.errors import NameUnknown, SpecificationError
 
-METHODS = ("Taylor", "RadauIIA", "RK4", "RK8", "DOP853", "RK45", "Radau", "BDF", "LSODA", "CVODES", "IDAS")
+METHODS = ("Taylor", "RadauIIA", "RK4", "RK8", "DOP853", "RK45", "Radau", "LSODA")
 g, UP = 9.81, 10.0
 
 
@@ -35,7 +35,7 @@ def test_a_ball_lands(ball, method):
     assert run.t_events["top"] == pytest.approx([end / 2], abs=1e-10)
     assert run.t_events["at 1 m"] == pytest.approx([1.0], abs=1e-10)
     assert not len(run.t_events["rises"])
-    assert run.events["top"]["y"] == pytest.approx([UP**2 / (2 * g)], abs=1e-7)  # CVODES errs by 1e-8
+    assert run.events["top"]["y"] == pytest.approx([UP**2 / (2 * g)], abs=1e-7)
     assert "lands" in repr(run)
 
 

@@ -116,8 +116,8 @@ def precise():
     "options",
     [
         {"method": "Taylor"}, {"method": "RadauIIA"}, {"method": "RK4"}, {"method": "DOP853"},
-        {"method": "DOP853", "drift": "project"}, {"method": "DOP853", "drift": "minimal"},
-        {"method": "DOP853", "drift": 0.05}, {"method": "CVODES"}, {"accuracy": 1e-6},
+        {"method": "DOP853", "drift": "project"},
+        {"method": "DOP853", "drift": 0.05}, {"method": "LSODA"}, {"accuracy": 1e-6},
     ],
     ids=lambda o: "-".join(map(str, o.values())),
 )  # fmt: skip

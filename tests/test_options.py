@@ -11,7 +11,7 @@ from benchmarks.literature.guided_arm import guided_arm
 from servoctl.methods.choice import as_method
 from servoctl.study import tradeoff as module
 
-ADAPTIVE = ("Taylor", "RadauIIA", "DOP853", "Radau", "LSODA", "CVODES", "IDAS")
+ADAPTIVE = ("Taylor", "RadauIIA", "DOP853", "Radau", "LSODA")
 SPAN = (0.0, 0.2)
 
 
@@ -123,7 +123,7 @@ def test_what_a_stability_map_is_asked_for(scene):
         stopped("step=", lambda step=step: found.radius("RK4", step))
 
 
-@pytest.mark.parametrize("method", ["RK4", "DOP853", "RadauIIA", "CVODES"])
+@pytest.mark.parametrize("method", ["RK4", "DOP853", "RadauIIA"])
 def test_error_dynamics_backwards_in_time(method, scene):
     model, start = scene
     end = sv.simulate(model, start, SPAN, method=sv.Taylor(rtol=1e-13, atol=1e-15), drift="project")
@@ -146,7 +146,7 @@ def test_poles_by_row_are_finite_numbers_that_damp(scene):
         sv.simulate(*scene, SPAN, drift=sv.Poles({"string": [1.0, -2.0]}))
 
 
-@pytest.mark.parametrize("method", ["RK23", "DOP853"])
+@pytest.mark.parametrize("method", ["RK45", "DOP853"])
 def test_poles_that_take_an_explicit_method_a_million_steps_are_told(method, scene):
     def ended(t):
         raise TimeoutError
@@ -157,7 +157,7 @@ def test_poles_that_take_an_explicit_method_a_million_steps_are_told(method, sce
 
 
 def test_tolerances_that_scipy_would_replace_are_refused(scene):
-    for method in ("RK23", "DOP853", "Radau", "BDF"):
+    for method in ("RK45", "DOP853", "Radau"):
         with refused(sv.SpecificationError, "rtol=1e-15", "2.22e-14"):
             sv.simulate(*scene, SPAN, method=as_method(method, rtol=1e-15))
     assert sv.simulate(*scene, SPAN, method=sv.Taylor(rtol=1e-15)).success

@@ -102,7 +102,7 @@ def test_scenes_against_differences(name, gallery_model):
             assert np.abs(s[signal, to] - difference).max() < 1e-7 * size, (signal, to)
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8", "CVODES"])
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8"])
 def test_a_damped_mass(method):
     """x = v0 m/c (1 - e^(-c t/m)), a plant without inputs."""
     p = sv.parameters(m=2.0, c=0.5)
@@ -142,7 +142,7 @@ SAMPLES = {"late": [1.0, 2.0, 3.0], "between": [0.7, 1.31, 2.0], "one": [2.5], "
 
 
 @pytest.mark.parametrize("times", SAMPLES.values(), ids=SAMPLES)
-@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8", "CVODES"])
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8"])
 def test_samples_that_begin_after_the_start(method, times):
     """A damped mass, x = x0 + v0 m/c (1 - e^(-c t/m)), forwards and backwards: derivatives are those from its start."""
     p = sv.parameters(m=2.0, c=0.5)
@@ -184,7 +184,7 @@ def two_masses(path=lambda t: 0.5 * ca.sin(t)):
     return sv.derive(mechanism, sv.Program({"X": x - path(q.t)}))
 
 
-@pytest.mark.parametrize("drift", [None, "project", "minimal", 0.1])
+@pytest.mark.parametrize("drift", [None, "project", 0.1])
 def test_internal_motion_sampled_after_the_start(drift):
     """2 y'' = k (x - y) + d (x' - y') with x = sin(t)/2, against the same motion for complex k, d and y0."""
     model = two_masses()

@@ -40,7 +40,7 @@ def test_internal_eigenvalues_are_those_of_the_closed_form(stiff):
 
 @pytest.mark.filterwarnings("ignore:Steps of:RuntimeWarning")
 @pytest.mark.parametrize("drift", [None, "project", 0.5])
-@pytest.mark.parametrize("method", ["RK1", "RK4", "RK8"])
+@pytest.mark.parametrize("method", ["RK4", "RK8"])
 def test_simulations_diverge_where_the_map_says(stiff, method, drift):
     model, run, found = stiff
     largest = found.largest_step(method, drift)
@@ -57,7 +57,7 @@ def test_simulations_diverge_where_the_map_says(stiff, method, drift):
 
 
 @pytest.mark.filterwarnings("ignore:Steps of:RuntimeWarning")
-@pytest.mark.parametrize("method", ["RK2", "RK4", "RK5"])
+@pytest.mark.parametrize("method", ["RK4", "RK8"])
 def test_poles_faster_than_the_internal_dynamics_decide(stiff, method):
     model, run, found = stiff
     pole = 400.0
@@ -89,22 +89,14 @@ def test_a_flat_program_has_steps_to_fear_only_where_poles_are_given(gallery_mod
     assert found.largest_step("RadauIIA", 0.001) == found.largest_step("Radau", 0.001) == np.inf
 
 
-def test_an_undamped_oscillation_is_amplified_by_methods_of_low_order(gallery_model):
-    """Car 2 swings on its spring with ω² = k/m = 1/2: Euler's factor is 1 + (hω)²/2, the midpoint rule's 1 + (hω)⁴/8."""
+def test_an_undamped_oscillation_has_the_limit_of_the_imaginary_axis(gallery_model):
+    """Car 2 swings on its spring with ω² = k/m = 1/2."""
     model, scene = gallery_model("two-cars-ideal"), gallery["two-cars-ideal"]
     run = sv.simulate(model, model.start(**scene.start), (0.0, 200.0), "Taylor")
     found = stability(model, run)
-    omega, T = np.sqrt(0.5), 200.0
+    omega = np.sqrt(0.5)
     assert np.allclose(np.abs(found.rates.imag), omega) and np.abs(found.rates.real).max() < 1e-12
-    assert found.largest_step("RK1") == pytest.approx(2 * np.log(2) / (omega**2 * T), rel=0.01)
-    assert found.largest_step("RK2") == pytest.approx((8 * np.log(2) / (omega**4 * T)) ** (1 / 3), rel=0.01)
     assert found.largest_step("RK4") == pytest.approx(np.sqrt(8) / omega, rel=0.01)
-    for method in ("RK1", "RK2"):
-        swing = []
-        for step in (1e-3, found.largest_step(method)):
-            moved = sv.simulate(model, model.start(**scene.start), (0.0, 200.0), as_method(method, step=step))
-            swing.append(np.ptp(moved["x2"][moved.t > 190.0]))
-        assert 1.8 < swing[1] / swing[0] < 2.3  # twofold over the plan, as the map's limit says
 
 
 def test_unstable_internal_dynamics_are_not_blamed_on_a_step(gallery_model):
@@ -136,8 +128,8 @@ def test_poles_that_fit_no_row_and_foreign_runs_are_refused(stiff, gallery_model
         found.largest_step("RK4", sv.Poles({"nothing": [-1.0, -2.0]}))
     with refused(sv.SpecificationError, row="z", count=2):
         found.largest_step("RK4", sv.Poles({"z": [-1.0]}))
-    with refused(sv.NameUnknown, name="BDF"):
-        found.largest_step("BDF")
+    with refused(sv.NameUnknown, name="LSODA"):
+        found.largest_step("LSODA")
     with refused(sv.SpecificationError, "x1"):
         stability(gallery_model("two-cars"), run)
 

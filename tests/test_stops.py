@@ -15,10 +15,10 @@ from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
 from servoctl.model.model import Model
 
-ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA", "Taylor")
-FIXED = ("RK1", "RK2", "RK4", "RK5", "RK8")
+ADAPTIVE = ("RK45", "DOP853", "Radau", "LSODA", "Taylor")
+FIXED = ("RK4", "RK8")
 METHODS = (*ADAPTIVE, *FIXED)
-MULTISTEP = ("BDF", "LSODA")  # carry past states, so that projection is refused
+MULTISTEP = ("LSODA",)  # carries past states, so that projection is refused
 ZERO = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0, "dtheta": 2.0}
 BACKWARDS_STOPS = 1.6956635129  # s: where the wheel stops when it starts with φ' = -1
 REFERENCE = {"rtol": 1e-13, "atol": 1e-14, "method": "DOP853", "dense_output": True}
@@ -86,9 +86,8 @@ def test_rk4_stops_when_the_wheel_stops(drift, step, squared, on_the_right_branc
     assert_told(error, cf.WHEEL_STOPS, max(1e-3, step))
 
 
-@pytest.mark.parametrize("method", ["RK2", "RK5", "RK8"])
-def test_other_fixed_step_methods_stop_when_the_wheel_stops(method, squared, on_the_right_branch):
-    error = stopped(squared, on_the_right_branch, (0.0, 2.0), method=method, step=1e-3)
+def test_another_fixed_step_method_stops_when_the_wheel_stops(squared, on_the_right_branch):
+    error = stopped(squared, on_the_right_branch, (0.0, 2.0), method="RK8", step=1e-3)
     assert_told(error, cf.WHEEL_STOPS, 1e-3)
 
 
@@ -102,19 +101,17 @@ def test_error_dynamics_do_not_carry_a_motion_through(method, squared, on_the_ri
 def test_the_linear_program_passes(method, gallery_model):
     model = gallery_model("appell-hamel")
     run = sv.simulate(model, model.start(dphi=1.0, **ZERO), (0.0, 2.0), method=as_method(method, **tolerances(method)))
-    within = 5e-2 if method == "RK1" else 1e-6
     assert run.success and run.t[-1] == 2.0
-    assert run["dphi"][-1] == pytest.approx(cf.APPELL_HAMEL_STATES[2.0][5], abs=within)
+    assert run["dphi"][-1] == pytest.approx(cf.APPELL_HAMEL_STATES[2.0][5], abs=1e-6)
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS if m != "RK1"])  # Euler's own error here is 7e-2 s
+@pytest.mark.parametrize("method", METHODS)
 def test_a_wheel_that_starts_backwards_stops_later(method, squared):
     start = squared.start(guess={"dx": -0.5}, dphi=-1.0, **ZERO)
     run = sv.simulate(squared, start, (0.0, 1.0), method=as_method(method, **tolerances(method)))
     assert run.success
-    finer = 1e-9 if method == "BDF" else 1e-8  # each restart of a multistep method adds to its residual
-    error = stopped(squared, start, (0.0, 2.5), method=method, **tolerances(method, finer))
-    assert_told(error, BACKWARDS_STOPS, 1e-2 if method == "RK2" else 1e-3)  # 6e-3 s is the midpoint rule's own error
+    error = stopped(squared, start, (0.0, 2.5), method=method, **tolerances(method))
+    assert_told(error, BACKWARDS_STOPS, 1e-3)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -123,7 +120,7 @@ def test_a_fast_wheel_does_not_stop(method, squared):
     run = sv.simulate(squared, start, (0.0, 2.0), method=as_method(method, **tolerances(method)))
     reference = cf.appell_hamel(run.t[[-1]], dphi=15.0)
     assert run.success
-    assert run["dphi"][-1] == pytest.approx(reference["dphi"][0], abs=0.1 if method == "RK1" else 1e-5)
+    assert run["dphi"][-1] == pytest.approx(reference["dphi"][0], abs=1e-5)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -151,15 +148,14 @@ def test_a_horizontal_force_ends_with_the_fall(method, drift, rtol, gallery_mode
     model, scene = gallery_model("constant-speed-horizontal"), gallery["constant-speed-horizontal"]
     start = model.start(**scene.start, guess=scene.guess)
     error = stopped(model, start, (0.0, 1.0), method=method, drift=drift, **tolerances(method, rtol))
-    within = 5e-3 if method == "RK1" else 2e-3 if method in FIXED else 1e-3
+    within = 2e-3 if method in FIXED else 1e-3
     assert abs(error.details["t"] - 5.0 / cf.GRAVITY) < within
-    assert method == "RK1" or ("dx" in error.details["zero"] and "dx = 0" in str(error))
+    assert "dx" in error.details["zero"] and "dx = 0" in str(error)
     assert "'speed'" in str(error)  # the row that loses its hold on the actuator
     run = error.run
     early = run.t < 0.45
     assert run.t[-1] > 0.45 and run["thrust"][-1] < 2 * run["thrust"][early].min() < 0  # it grows without bound
-    if method != "RK1":
-        assert run["thrust"][early] == pytest.approx(cf.constant_speed_horizontal(run.t[early])["thrust"], rel=1e-4)
+    assert run["thrust"][early] == pytest.approx(cf.constant_speed_horizontal(run.t[early])["thrust"], rel=1e-4)
 
 
 # no false alarms -----------------------------------------------------------------------------------------------------
@@ -167,7 +163,7 @@ def test_a_horizontal_force_ends_with_the_fall(method, drift, rtol, gallery_mode
 SINGULAR = ("appell-hamel-squared", "constant-speed-horizontal")
 
 
-@pytest.mark.parametrize("method", ["RK45", "DOP853", "Radau", "BDF", "LSODA", "Taylor", "RK4"])
+@pytest.mark.parametrize("method", ["RK45", "DOP853", "Radau", "LSODA", "Taylor", "RK4"])
 @pytest.mark.parametrize("name", [name for name in CERTIFIED if name not in SINGULAR])
 def test_no_false_alarm(name, method, gallery_model):
     model, scene = gallery_model(name), gallery[name]
@@ -248,7 +244,7 @@ def precise(method):
     ("kind", "method"),
     [
         *(("equation", method) for method in ("DOP853", "Radau", "LSODA", "Taylor", "RK4")),
-        *(("curvature", method) for method in ("DOP853", "RK45", "BDF", "RK8")),
+        *(("curvature", method) for method in ("DOP853", "RK45", "RK8")),
     ],
 )
 def test_a_particle_goes_round_and_round(kind, method, derived):
@@ -257,7 +253,7 @@ def test_a_particle_goes_round_and_round(kind, method, derived):
     run = sv.simulate(model, start, (0.0, 20.0), method=as_method(method, **precise(method)), drift=drifts(method)[-1])
     assert run.success and run.counters["pivot_changes"] == 1  # to those of definite matrices, which last
     error = np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max()
-    assert error < (1e-6 if method == "BDF" else 1e-8)
+    assert error < 1e-8
 
 
 def derives_again(patch):
@@ -399,7 +395,7 @@ def pulled_along(path):
     return model, model.start(th=0.2, dth=0.0)
 
 
-@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA", "BDF"])
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA", "LSODA"])
 @pytest.mark.parametrize("name", UNDEFINED)
 def test_no_sample_is_without_finite_accelerations(name, method):
     model, start = pulled_along(UNDEFINED[name])

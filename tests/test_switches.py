@@ -17,11 +17,9 @@ from servoctl.jets.tape import REAL, Tape
 from servoctl.model.switching import switching
 from servoctl.simulation import simulated
 
-ONE_STEP = ("DOP853", "RK45", "Radau", "LSODA", "Taylor", "RadauIIA", "RK4", "RK8")
-MULTISTEP = ("BDF", "CVODES", "IDAS")  # at their default rtol of 1e-9 the smooth motion itself errs by 1e-7
-METHODS = (*ONE_STEP, *MULTISTEP)
+METHODS = ("DOP853", "RK45", "Radau", "LSODA", "Taylor", "RadauIIA", "RK4", "RK8")
 DRIFTS = [(m, d) for m in ("DOP853", "RK4", "RadauIIA", "Taylor") for d in ("project", 0.1) if (m, d) != ("Taylor", 0.1)]
-PAIRS = [*((m, None) for m in METHODS), *DRIFTS, ("DOP853", "minimal")]
+PAIRS = [*((m, None) for m in METHODS), *DRIFTS]
 EVENTS = {"rtol": 1e-13, "atol": 1e-14, "method": "DOP853", "dense_output": True}
 
 
@@ -93,7 +91,7 @@ def stop(t):
 def test_dry_friction_is_integrated_from_reversal_to_reversal(method, drift):
     model, start = beside(lambda t, y, dy: -9 * y - 2 * ca.sign(dy), y=2.0, dy=0.0)
     run = sv.simulate(model, start, (0.0, 2.8), method, drift=drift)
-    assert np.abs(run["y"] - friction(run.t)).max() < (3e-7 if method in MULTISTEP else 1e-8)
+    assert np.abs(run["y"] - friction(run.t)).max() < 1e-8
     assert run.knots[1:] == pytest.approx([np.pi / 3, 2 * np.pi / 3], abs=1e-8)
 
 
@@ -101,7 +99,7 @@ def test_dry_friction_is_integrated_from_reversal_to_reversal(method, drift):
 def test_a_stop_is_met_and_left(method, drift):
     model, start = beside(potential=lambda y: 400 * ca.fmax(y - 0.1, 0) ** 2 / 2, y=0.0, dy=1.0)
     run = sv.simulate(model, start, (0.0, 1.0), method, drift=drift)
-    assert np.abs(run["y"] - stop(run.t)).max() < (3e-7 if method in MULTISTEP else 1e-8)
+    assert np.abs(run["y"] - stop(run.t)).max() < 1e-8
     assert run.knots == pytest.approx([0.1, 0.1 + np.pi / 20], abs=1e-8)
 
 
@@ -256,7 +254,7 @@ ENDS = {  # residual, start, end, what explains it
 }
 
 
-@pytest.mark.parametrize(("method", "drift"), [*((m, None) for m in METHODS if m != "IDAS"), *DRIFTS])
+@pytest.mark.parametrize(("method", "drift"), [*((m, None) for m in METHODS), *DRIFTS])
 @pytest.mark.parametrize("name", ["asin", "asin of a velocity"])
 def test_a_program_that_ends_stops_the_motion_there(name, method, drift):
     residual, held, end, why = ENDS[name]
@@ -282,7 +280,7 @@ def test_other_ends_of_programs(name):
         assert caught.value.details["t"] == pytest.approx(end, abs=1e-3)
 
 
-@pytest.mark.parametrize(("method", "drift"), [*PAIRS, ("RK4", "minimal"), ("RK8", "project")])
+@pytest.mark.parametrize(("method", "drift"), [*PAIRS, ("RK8", "project")])
 def test_a_jump_without_a_switch_is_found(method, drift):
     """atan(1/z) jumps by π at z = 0, and its rates do not."""
     model, start = ideal(lambda t, x, y, dx, dy: y - 0.1 * ca.atan(1 / (x - 0.5)), x=0.0, dx=1.0)
@@ -294,20 +292,20 @@ def test_a_jump_without_a_switch_is_found(method, drift):
 def test_coarse_steps_are_no_jump():
     """A circle by steps of which each errs by far more than a tolerance: the user's choice."""
     model, start = ideal(lambda t, x, y, dx, dy: x**2 + y**2 - 1, x=1.0, y=0.0, dy=1.0)
-    for order, step in ((1, 1e-3), (2, 0.02), (4, 0.2)):
+    for order, step in ((4, 0.2), (8, 0.8)):
         run = sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step))
         assert run.success and np.abs(run.residual["p"][0]).max() > 1e-6
-        for drift in ("project", sv.Project(5), "minimal"):
+        for drift in ("project", sv.Project(5)):
             assert sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step), drift=drift).success
 
 
 def test_a_first_step_as_long_as_the_span_is_not_believed(gallery_model):
-    """The path of the pendubot rests at both ends: BDF's first step, from rates of zero, would be the whole span."""
+    """The path of the pendubot rests at both ends: a first step, from rates of zero, would be the whole span."""
     from servoctl.gallery import gallery
 
     model, scene = gallery_model("pendubot"), gallery["pendubot"]
     start = model.start(**scene.start, guess=scene.guess)
-    runs = [sv.simulate(model, start, scene.t_span, method) for method in ("BDF", "Taylor")]
+    runs = [sv.simulate(model, start, scene.t_span, method) for method in ("LSODA", "Taylor")]
     assert np.abs(runs[0].jets[:4] - runs[1].jets[:4]).max() < 1e-5
 
 
@@ -319,7 +317,7 @@ def test_a_heading_turns_round_and_round(method, drift):
     """Speed 1 in the direction t: a circle, beyond t = π and t = 3π."""
     model, start = ideal(lambda t, x, y, dx, dy: ca.atan2(dy, dx) - t, dx=1.0, x=0.0, y=0.0)
     run = sv.simulate(model, start, (0.0, 10.0), method, drift=drift)
-    assert np.abs(run["x"] - np.sin(run.t)).max() < (1e-6 if method in MULTISTEP else 1e-8)
+    assert np.abs(run["x"] - np.sin(run.t)).max() < 1e-8
     assert np.abs(run.residual["p"]).max() < 1e-6
 
 
@@ -426,7 +424,7 @@ def test_a_grazing_contact_is_found(method):
 
 # what a step might not see --------------------------------------------------------------------------------------------
 
-ADAPTIVE = (*(m for m in METHODS if not m.startswith("RK")), "RK45", "RK23")
+ADAPTIVE = tuple(m for m in METHODS if m not in ("RK4", "RK8"))
 NARROW = {  # force(t, x, y), start (y, dy), span; x = t moves past what depends on it
     "a bump in time": (lambda t, x, y: 10 * ca.exp(-((100 * (t - 3)) ** 2)), (0.0, 0.0), (0.0, 5.0)),
     "a bump late in a long rest": (lambda t, x, y: 10 * ca.exp(-((100 * (t - 33.3)) ** 2)), (0.0, 0.0), (0.0, 40.0)),
@@ -479,13 +477,13 @@ def test_no_method_steps_over_a_narrow_force(name, method):
 
 @pytest.mark.parametrize("name", NARROW)
 def test_intervals_between_samples_hide_no_flank(name):
-    """CVODES between two samples alone, without those of the verdict on growth."""
+    """LSODA between two samples alone, without those of the verdict on growth."""
     force, start, span = NARROW[name]
-    run = simulated(*pushed(force, *start), span, "CVODES", t_eval=span)
+    run = simulated(*pushed(force, *start), span, "LSODA", t_eval=span)
     assert [run["y"][-1], run["dy"][-1]] == pytest.approx(narrow_reference(name), abs=2e-6)
 
 
-@pytest.mark.parametrize("settings", [{"method": "DOP853", "drift": "minimal"}, {"method": "RadauIIA", "drift": "project"},
+@pytest.mark.parametrize("settings", [{"method": "RadauIIA", "drift": "project"},
                                       {"method": "RadauIIA", "drift": 0.1}, {"accuracy": 1e-8},
                                       {"method": sv.RadauIIA(5)}, {"method": sv.RadauIIA(13)}], ids=str)  # fmt: skip
 def test_no_setting_steps_over_a_narrow_force(settings):
@@ -562,19 +560,19 @@ PULSES = {  # of time alone, or of the place x = t: their impulse is 1, about t 
 @pytest.mark.parametrize("name", PULSES)
 def test_two_switches_within_a_step_are_both_met(name, of):
     pulse = PULSES[name]
-    for method in (*METHODS, "RK1"):
+    for method in METHODS:
         model, start = pushed(lambda t, x, y: pulse(t if of == "time" else x), 0.0, 0.0)
         run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
         middle = 1.00037 if "square" in name else 1.0
         assert run["dy"][-1] == pytest.approx(1.0, abs=1e-6)
-        assert run["y"][-1] == pytest.approx(2.0 - middle, abs=2e-3 if method == "RK1" else 1e-6)
+        assert run["y"][-1] == pytest.approx(2.0 - middle, abs=1e-6)
         assert len(run.knots) >= 2
 
 
 def test_a_square_wave_switches_every_time():
     """The triangle of its impulse ends at 2 - 25 π/40, with 26 changes of the sign of sin 40 t up to 2 s."""
     model, start = pushed(lambda t, x, y: ca.sign(ca.sin(40 * t)), 0.0, 0.0)
-    for method in ("DOP853", "Taylor", "RadauIIA", "RK4", "CVODES"):
+    for method in ("DOP853", "Taylor", "RadauIIA", "RK4"):
         run = sv.simulate(model, start, (0.0, 2.0), method)
         assert run["dy"][-1] == pytest.approx(np.pi / 40 - (2 - 25 * np.pi / 40), abs=1e-7)
 

@@ -23,8 +23,7 @@ def _largest_steps(stability, ax, poles, methods):
     for colour, method in zip(style.COLOURS, methods, strict=False):
         steps = np.array([stability.largest_step(method, 1.0 / pole) for pole in poles])
         name = f"Taylor, order {stability.order}" if method == "Taylor" else method
-        line = "--" if method == "RK2" else "-"  # it coincides with RK1 on the real axis
-        ax.loglog(poles, np.where(steps > 0, steps, np.nan), line, color=colour, label=name)
+        ax.loglog(poles, np.where(steps > 0, steps, np.nan), color=colour, label=name)
     ax.set(xlabel="poles of the error dynamics, 1/T [1/s]", ylabel="step h [s]")
     ax.set_title("Largest stable step", fontsize=11)
     ax.grid(alpha=0.3)

@@ -11,7 +11,6 @@ COLOURS = (*style.COLOURS, *style.MORE)
 LOOKS = {  # line, marker and label of each treatment of drift
     "none": ("-", "o", "as it drifts"),
     "project": ("--", "s", "projected"),
-    "minimal": (":", "^", "minimal coordinates"),
 }
 MARKS = ("o", "s", "^", "D", "v", "P", "X")
 AXIS_MARGIN = 1.5  # from the cheapest and the dearest row to the ends of the axis: small differences look small

@@ -7,16 +7,14 @@ that instant, so that its stages see what it stepped over.
 """
 
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.methods.choice import MinimalCoordinates
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import FINER, RESOLUTION, End, net, steps_of
+from servoctl.methods.watch import RESOLUTION, End, net, steps_of
 from servoctl.values import frozen
 
 OFF = 1e3  # times the tolerance, which the equations may add to a step
@@ -102,9 +100,6 @@ class BulkSteps(Stepping):
         if doubt is not None and not good:
             return Fine(0), doubt
         outcome = self._inspected(stretch.first(good) if doubt is not None else stretch)
-        if isinstance(self.drift, MinimalCoordinates) and outcome.steps:
-            torn = self._torn(stretch, outcome.steps)
-            outcome = outcome if torn is None else torn
         if isinstance(outcome, End) and outcome.error and first and doubts and not outcome.steps:
             return Fine(0), stretch.t[0] + SHORTER * (stretch.t[1] - stretch.t[0])
         return outcome, doubt if isinstance(outcome, Fine) else None
@@ -162,7 +157,7 @@ class BulkSteps(Stepping):
             change = h[k] * stretch.slope(k, at)
             sizes = np.zeros((len(x), len(h)))
             np.maximum.at(sizes, (slice(None), k), np.fmax(np.abs(x), np.abs(change)))
-            allowed = self.off * (np.reshape(atol, (-1, 1)) + rtol * sizes[:, k]) + self._slack(k, h)
+            allowed = self.off * (np.reshape(atol, (-1, 1)) + rtol * sizes[:, k])
             excess = np.nan_to_num(np.abs(h[k] * rates - change) / allowed, posinf=np.inf).max(axis=0, initial=0.0)
         wrong = np.flatnonzero(excess > 1.0)
         if not len(wrong):
@@ -170,26 +165,6 @@ class BulkSteps(Stepping):
         good = k[wrong].min()
         worst = wrong[k[wrong] == good]
         return int(good), float(at[worst[np.argmax(excess[worst])]])
-
-    def _torn(self, stretch, steps):
-        """Where states that are solved for jump within the first steps, as an `End`, or None."""
-        k, at, x, rates = self.net
-        count = int(np.searchsorted(k, steps))
-        t, states = np.append(stretch.t[0], at[:count]), np.column_stack([stretch.x[:, 0], x[:, :count]])
-        start = self.f(t[0], states[:, 0], self.p)[: self.n_x]
-
-        def finer(a, x, b):
-            times = np.linspace(a, b, FINER + 1)
-            inside = stretch.dense(steps_of(stretch.t, times[1:]), times[1:])
-            both = np.column_stack([x, inside])
-            return times, both, self.f.grid(times, both, self.p)[: self.n_x]
-
-        end = self.watch.torn(t, states, np.column_stack([start, rates[:, :count]]), finer)
-        return end if end is None else replace(end, steps=int(steps_of(stretch.t, np.array([end.t]))[0]))
-
-    def _slack(self, k, h):
-        """How far the dense output of steps k (N,) of lengths h may be beyond the tolerance."""
-        return 0.0
 
     def _record(self, steps, first, last, end=None):
         """Record the pending samples from the start of step `first` to the start of step `last`, or an end within."""

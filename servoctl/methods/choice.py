@@ -19,19 +19,14 @@ from servoctl.checks import (
 from servoctl.errors import SpecificationError, unknown
 from servoctl.values import frozen
 
-ORDERS = {"RK1": 1, "RK2": 2, "RK4": 4, "RK5": 5, "RK8": 8}
-"""Order of each Runge-Kutta method: Euler's, the midpoint rule, the classical one of Kutta (1901), Dormand and
-Prince's of orders 5 (1980) and 8 (Prince and Dormand 1981)."""
+ORDERS = {"RK4": 4, "RK8": 8}
+"""Order of each Runge-Kutta method: the classical one of Kutta (1901), and that of Prince and Dormand (1981)."""
 RADAU_ORDERS = (5, 9, 13)
-SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
-EXPLICIT, MULTISTEP = ("RK23", "RK45", "DOP853"), ("BDF", "LSODA")
-SUNDIALS = ("CVODES", "IDAS")
+SCIPY = ("RK45", "DOP853", "Radau", "LSODA")
+EXPLICIT = ("RK45", "DOP853")
 SMALLEST_RTOL = 100 * np.finfo(float).eps  # that scipy's methods except LSODA accept: they replace a smaller one
 LARGE_FOR_SERIES = 300  # operations of the rates, above which a series takes a second to make, and more to compile
 REAL = 1e-9  # imaginary part of a pole polynomial, relative to its largest coefficient, that is rounding
-
-PAST_STATES = "A multistep method carries past states, which projection would contradict."
-MOVING_CHART = "The integrated coordinates change along the motion, which invalidates past states and compiled loops."
 
 
 # treatments of drift -------------------------------------------------------------------------------------------------
@@ -154,20 +149,12 @@ class Project:
         return "projected after every step" if self.every == 1 else f"projected after every {self.every} steps"
 
 
-@frozen
-class MinimalCoordinates:
-    """Integration of as many values as the program leaves free; the others are solved from the constraints."""
-
-    def __str__(self):
-        return "minimal coordinates"
-
-
-SHORT_FORMS = {"none": None, "project": Project(), "minimal": MinimalCoordinates()}
+SHORT_FORMS = {"none": None, "project": Project()}
 
 
 def as_drift(value):
     """The treatment that `drift=` stands for: None, a short form, a time constant [s], or a value."""
-    if value is None or isinstance(value, (Poles, Project, MinimalCoordinates)):
+    if value is None or isinstance(value, (Poles, Project)):
         return value
     if isinstance(value, str):
         if value not in SHORT_FORMS:
@@ -244,10 +231,7 @@ class Taylor(Method):
     rtol: float = 1e-9
     atol: float | None = None
 
-    refused = {
-        Poles: "The series are those of the undisturbed rows; error dynamics would need series of their own.",
-        MinimalCoordinates: "The series give every jet directly from the rows; there is nothing left to solve.",
-    }
+    refused = {Poles: "The series are those of the undisturbed rows; error dynamics would need series of their own."}
 
     def __post_init__(self):
         self._check(order=range(2, MOST_JETS + 1), jets=range(1, MOST_JETS + 1))
@@ -255,12 +239,12 @@ class Taylor(Method):
 
 @frozen(repr=False)
 class RungeKutta(Method):
-    """Compiled explicit Runge-Kutta steps of fixed length; the short forms are "RK1" to "RK8".
+    """Compiled explicit Runge-Kutta steps of fixed length; the short forms are "RK4" and "RK8".
 
     Parameters
     ----------
-    order : {1, 2, 4, 5, 8}
-        Euler's method, the midpoint rule, the classical one of Kutta, and Dormand and Prince's of orders 5 and 8.
+    order : {4, 8}
+        The classical one of Kutta, or that of Prince and Dormand.
     step : float, optional
         Step length [s]; default (t1 - t0)/2000. Steps are shortened to end at the knots of paths. A warning is
         issued where they do not resolve the motion.
@@ -297,9 +281,7 @@ class Bounded(Method):
     rtol: float = 1e-9
 
     forward = False
-    refused = dict.fromkeys(
-        (Project, Poles, MinimalCoordinates), "The constraints hold at every node, so that nothing drifts."
-    )
+    refused = dict.fromkeys((Project, Poles), "The constraints hold at every node, so that nothing drifts.")
 
     def __post_init__(self):
         self._check()
@@ -328,8 +310,6 @@ class RadauIIA(Method):
     rtol: float = 1e-9
     atol: float | None = None
 
-    refused = {MinimalCoordinates: MOVING_CHART}
-
     def __post_init__(self):
         self._check(order=RADAU_ORDERS)
 
@@ -340,7 +320,7 @@ class Adaptive(Method):
 
     Parameters
     ----------
-    name : {"RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA"}
+    name : {"RK45", "DOP853", "Radau", "LSODA"}
         As in `scipy.integrate`.
     rtol, atol : float
         Tolerances of a step; rtol at least 2.2e-14 except for "LSODA"; default atol as for `Taylor`.
@@ -369,34 +349,8 @@ class Adaptive(Method):
 
     @property
     def refused(self):
-        """Treatments of drift that a multistep method cannot take, with the reason."""
-        return {Project: PAST_STATES, MinimalCoordinates: MOVING_CHART} if self.name in MULTISTEP else {}
-
-
-@frozen(repr=False)
-class Sundials(Method):
-    """The multistep methods of SUNDIALS, through CasADi; "IDAS" integrates the rows before elimination.
-
-    Parameters
-    ----------
-    name : {"CVODES", "IDAS"}
-    rtol, atol : float
-        Tolerances of a step; default atol as for `Taylor`.
-    """
-
-    name: str = "CVODES"
-    rtol: float = 1e-9
-    atol: float | None = None
-
-    named_by = ("name",)
-    refused = {Project: PAST_STATES, MinimalCoordinates: MOVING_CHART}
-
-    def __post_init__(self):
-        named(self.name, SUNDIALS, "method of SUNDIALS")
-        self._check()
-
-    def __str__(self):
-        return self.name
+        """The treatment of drift that a multistep method cannot take, with the reason."""
+        return {Project: "It carries past states, which projection would contradict."} if self.name == "LSODA" else {}
 
 
 @frozen(repr=False)
@@ -417,7 +371,7 @@ class Automatic(Taylor):
         return Adaptive(rtol=self.rtol, atol=self.atol) if self.jets is None and self.order is None else None
 
 
-_FAMILIES = ((RungeKutta, ORDERS.values()), (Adaptive, SCIPY), (Sundials, SUNDIALS))
+_FAMILIES = ((RungeKutta, ORDERS.values()), (Adaptive, SCIPY))
 _NAMED = (family(name) for family, names in _FAMILIES for name in names)
 _DEFAULTS = (Algebraic(), Taylor(), RadauIIA(), Bounded(), *_NAMED)
 METHODS = {str(method): method for method in _DEFAULTS}
@@ -479,7 +433,7 @@ def require_combination(model, method, drift):
     ----------
     model : Model
     method : Method
-    drift : None, Project, Poles or MinimalCoordinates
+    drift : None, Project or Poles
 
     Raises
     ------
@@ -499,20 +453,12 @@ def require_combination(model, method, drift):
             nearest="method='algebraic'.",
             free=0,
         )
-    combination = f"drift={drift!r} was given with method={str(method)!r}"
-    if isinstance(drift, MinimalCoordinates) and model.flat and not isinstance(method, Algebraic):
-        raise SpecificationError(
-            f"{combination} for a program that determines the motion completely.",
-            "Without free initial values there is nothing to integrate: each instant is a Newton solve.",
-            nearest="method='algebraic'.",
-            free=0,
-        )
     if type(drift) in method.refused:
         forms = {**{repr(form): type(value) for form, value in SHORT_FORMS.items()}, "a time constant": Poles}
         possible = [form for form, treatment in forms.items() if treatment not in method.refused]
         methods = [name for name, other in METHODS.items() if type(drift) not in other.refused and name != "algebraic"]
         raise SpecificationError(
-            f"{combination}.",
+            f"drift={drift!r} was given with method={str(method)!r}.",
             method.refused[type(drift)],
             do=f"Choose drift={', '.join(possible)} for this method, or one of the methods {', '.join(methods)}.",
             method=str(method),

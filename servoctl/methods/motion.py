@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError
-from servoctl.methods.choice import MinimalCoordinates, Poles
+from servoctl.methods.choice import Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
@@ -237,7 +237,7 @@ class Stepping:
     ----------
     model : Model
     method : str
-    drift : None, Poles, Project or MinimalCoordinates
+    drift : None, Poles or Project
     progress : callable
     """
 
@@ -319,8 +319,7 @@ class Stepping:
 
     def _watch(self, t, x, t1):
         """Watch for the ends of smooth pieces, from the start on."""
-        exact = isinstance(self.drift, MinimalCoordinates)
-        self.watch = Watch(self.tolerances, abs(t1 - t), self.family, exact, self.parts)
+        self.watch = Watch(self.tolerances, abs(t1 - t), self.family, exact=False, parts=self.parts)
         self.watch.method, self.watch.advice = self.method, self.advice if self.tolerances is None else ADVICE
         branches = () if self.family is None else self.family.branches(t, x)
         self.watch.use(self.model, branches, self._error_dynamics())

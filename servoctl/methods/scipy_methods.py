@@ -3,12 +3,10 @@
 import numpy as np
 
 from servoctl.methods.bulk import BulkSteps, Steps, differentiated
-from servoctl.methods.choice import MinimalCoordinates, Project
-from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
+from servoctl.methods.choice import Project
 from servoctl.methods.watch import edge
 from servoctl.values import frozen
 
-IMPLICIT = ("Radau", "BDF")
 AT_ONCE = 16  # steps that are inspected together, at most: twice as many each time
 MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
 
@@ -27,22 +25,15 @@ class Solved(Steps):
 
     def at(self, k, times):
         """States (n_x, N) at times (N,) within steps k (N,)."""
-        return self._each(lambda dense: dense, k, times)
-
-    def slope(self, k, times):
-        """Their derivatives; NaN for entries that are not integrated."""
-
-        def integrated(dense):
-            return getattr(dense, "integrated", dense)
-
-        return differentiated(lambda k, s: self._each(integrated, k, s), self.t, k, times)
-
-    def _each(self, part, k, times):
         states = np.empty((len(self.x), len(times)))
         for step in np.unique(k):
             here = k == step
-            states[:, here] = part(self.dense[step])(times[here])
+            states[:, here] = self.dense[step](times[here])
         return states
+
+    def slope(self, k, times):
+        """Their derivatives."""
+        return differentiated(self.at, self.t, k, times)
 
 
 class ScipySteps(BulkSteps):
@@ -53,7 +44,7 @@ class ScipySteps(BulkSteps):
     model : Model
     method : str
         One of `choice.SCIPY`.
-    drift : None, Poles, Project or MinimalCoordinates
+    drift : None, Poles or Project
     rtol, atol : float
     progress : callable
     """
@@ -62,14 +53,13 @@ class ScipySteps(BulkSteps):
 
     def __init__(self, model, method, drift, rtol, atol, progress):
         self.tolerances = rtol, atol
-        self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         self.projects = isinstance(drift, Project)
         super().__init__(model, method, drift, progress)
 
     def _use(self, model):
         super()._use(model)
         name = f"{self.f.name}_jacobian"
-        self.slopes = model.function(name) if self.method in IMPLICIT else None
+        self.slopes = model.function(name) if self.method == "Radau" else None
         self.projection = model.function("ode_projected") if self.projects else None
         self.solver = None
 
@@ -90,20 +80,14 @@ class ScipySteps(BulkSteps):
         import scipy.integrate
 
         rtol, atol = self.tolerances
-
-        def solver(rates, t, y, jacobian, **options):
-            exact = {"jac": jacobian} if self.slopes is not None else {}
-            return getattr(scipy.integrate, self.method)(rates, t, y, b, rtol=rtol, atol=atol, **options, **exact)
-
-        if self.sizes is not None:
-            return MinimalSolver(solver, Chart(self.model, self.sizes, a, x), a, x)
-        return solver(self._rates, a, x, self._jacobian)
+        exact = {"jac": self._jacobian} if self.slopes is not None else {}
+        return getattr(scipy.integrate, self.method)(self._rates, a, x, b, rtol=rtol, atol=atol, **exact)
 
     def _continued(self, t, x, b):
         """The solver that goes on from t, X = x towards b."""
         (first, last), s = self._beside(t, b), self.solver
         if s is None or s.status != "running" or s.t != first or s.t_bound != last or not np.array_equal(s.y, x):
-            self.solver, self.counted = self._solver(first, x, last), np.zeros(4, dtype=int)
+            self.solver, self.counted = self._solver(first, x, last), np.zeros(3, dtype=int)
         return self.solver
 
     def _steps(self, t, x, b):
@@ -119,7 +103,7 @@ class ScipySteps(BulkSteps):
                 self._project()
             t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
-        self.most = min(2 * self.most, AT_ONCE) if self.sizes is None else 1
+        self.most = min(2 * self.most, AT_ONCE)
         self._count(len(dense))
         if not self.failure and self._creeps(len(dense)):
             self.failure = "its steps shrink"
@@ -145,17 +129,13 @@ class ScipySteps(BulkSteps):
         return self.projection.restore_grid(times, states, self.p) if self.projects else states
 
     def _work(self):
-        """Evaluations, Jacobians, decompositions and changes of coordinates so far."""
-        s = self.solver
-        return np.array([*s.work, s.changes] if self.sizes is not None else [s.nfev, s.njev, s.nlu, 0])
+        """Evaluations, Jacobians and decompositions so far."""
+        return np.array([self.solver.nfev, self.solver.njev, self.solver.nlu])
 
     def _count(self, steps):
         before, self.counted = self.counted, self._work()
-        nfev, njev, nlu, changes = self.counted - before
+        nfev, njev, nlu = self.counted - before
         self.motion.count(steps=steps, nfev=nfev, njev=njev, nlu=nlu)
-        if self.sizes is not None:
-            self.motion.counters["integrated"] = len(self.solver.chart.free)
-            self.motion.count(coordinate_changes=changes)
 
 
 def _step(solver):
@@ -164,5 +144,5 @@ def _step(solver):
         with np.errstate(all="ignore"):
             return solver.step()
     except ValueError:
-        getattr(solver, "solver", solver).status = "failed"
+        solver.status = "failed"
         return "the Jacobian is not finite"

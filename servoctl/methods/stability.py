@@ -16,8 +16,7 @@ from servoctl.methods.motion import breakpoints, equal_steps
 from servoctl.methods.runge_kutta import tableau
 from servoctl.methods.sizes import state_levels
 
-SAME = {"DOP853": "RK8", "RK45": "RK5"}  # scipy's adaptive methods that go on with the result of these tableaus
-STEP_MAPS = (*ORDERS, *SAME, "RK23", "Taylor", "RadauIIA", "Radau")
+STEP_MAPS = (*ORDERS, "DOP853", "RK45", "Taylor", "RadauIIA", "Radau")
 WITH_ORDER = ("Taylor", "RadauIIA")
 BEYOND = 1e-10  # |R| - 1 that separates roots of |R|² = 1 where |R| crosses 1 from those where it touches 1
 MANY_STEPS = 1e5  # steps of an adaptive method in a span that deserve a warning: each takes part of a millisecond
@@ -68,9 +67,7 @@ def _fraction(method, order):
         return _pade(stages - 1, stages), _pade(stages, stages - 1) * (-1.0) ** np.arange(stages + 1)
     if method == "Taylor":
         return np.array([1 / factorial(k) for k in range(order + 1)]), np.ones(1)
-    if method == "RK23":
-        return np.array([1.0, 1.0, 1 / 2, 1 / 6]), np.ones(1)  # three stages of order 3
-    a, b, _ = tableau(SAME.get(method, method))
+    a, b, _ = tableau(method)
     powers, coefficients = np.ones(len(b)), [1.0]
     for _ in range(len(b)):
         coefficients.append(b @ powers)
@@ -116,7 +113,7 @@ def largest_explicit(method, order=None, direction=pi):
     order : int, optional
         Order of "Taylor" or "RadauIIA".
     direction : float
-        arg λ [rad]; default π, the negative real axis: 2, 2, 2.785, 3.307 for RK1, RK2, RK4, RK5.
+        arg λ [rad]; default π, the negative real axis: 2.785, 3.307 for RK4, RK45.
 
     Returns
     -------

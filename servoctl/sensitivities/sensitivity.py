@@ -20,7 +20,7 @@ from servoctl.sensitivities.tangent import along_state, determined, invariants_b
 from servoctl.values import Value, frozen
 
 RTOL = 1e-11  # of a step of the variational equation
-STIFF = ("Radau", "BDF", "RadauIIA", "CVODES", "IDAS")  # methods of runs whose variational equation is stiff, too
+STIFF = ("Radau", "RadauIIA")  # methods of runs whose variational equation is stiff, too
 DEPENDS = 1e-8  # of a column of the invariants' Jacobian: what is left after others, below which it depends on them
 BESIDE_KNOT = 1e-9  # of the span: instants before and after a knot at which rates are compared
 JUMPS = 1e-6  # of the rates: a larger difference there is a jump

@@ -113,13 +113,13 @@ def _shard(text):
 
 
 def _drift(text):
-    return text if text in ("none", "project", "minimal") else float(text)
+    return text if text in ("none", "project") else float(text)
 
 
 whole, count = _at_least(0), _at_least(1)
 draws, samples = _at_least(1, MOST_CASES), _at_least(2, MOST_SAMPLES)
 positive = _typed(_number(above=0.0), "not a positive number")
-drift = _typed(_drift, "not none, project, minimal or a time constant [s]")
+drift = _typed(_drift, "not none, project or a time constant [s]")
 shard = _typed(_shard, "not I/N with I from 1 to N, such as 1/4")
 _pair = "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
 assignment = _named(_number(), _pair)

@@ -15,8 +15,7 @@ from servoctl.figures.sheet import draw_sheet
 from servoctl.figures.style import write_png
 from servoctl.inversion.verdict import GROWS, MARGINAL, chosen_by, verdict, verdict_with
 from servoctl.methods.bounded import Problem
-from servoctl.methods.choice import Bounded, as_drift, as_method, default_method
-from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.choice import ORDERS, Bounded, as_drift, as_method, default_method
 from servoctl.progress import stage
 from servoctl.shell import loop
 from servoctl.shell.folder import ANIMATION, FIGURES, folder_of, jsonable, summary
@@ -39,7 +38,7 @@ def add_run(run):
     run.add_argument("--accuracy", type=float, metavar="E", help="largest error of the motion; sets method and steps")
     run.add_argument("--method", help=METHODS_HELP)
     run.add_argument("--step", type=float, metavar="H", help=f"step of {', '.join(ORDERS)} and RadauIIA [s]")
-    run.add_argument("--drift", type=drift, metavar="D", help="none, project, minimal, or a time constant [s]")
+    run.add_argument("--drift", type=drift, metavar="D", help="none, project, or a time constant [s]")
     run.add_argument("--rtol", type=float, help="relative tolerance")
     run.add_argument("--atol", type=float, help="absolute tolerance")
     run.add_argument("--samples", type=samples, metavar="N", help="equally spaced samples of the run")

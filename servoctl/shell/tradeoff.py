@@ -15,8 +15,8 @@ def add_tradeoff(trade):
     """Add the arguments of the command."""
     add_motion(trade)
     trade.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-tradeoff")
-    trade.add_argument("--method", nargs="+", metavar="M", help="methods to measure; default: all but RK1, RK2, RK23")
-    trade.add_argument("--drift", type=drift, nargs="+", metavar="D", help="none, project, minimal, time constants [s]")
+    trade.add_argument("--method", nargs="+", metavar="M", help="methods to measure; default: all")
+    trade.add_argument("--drift", type=drift, nargs="+", metavar="D", help="none, project, time constants [s]")
     trade.add_argument("--limit", type=positive, metavar="S", help="seconds that one run may take; default 0.3")
     wanted = trade.add_mutually_exclusive_group()
     wanted.add_argument("--error", type=positive, metavar="E", help="recommend the fastest within this error")

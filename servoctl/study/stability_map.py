@@ -3,7 +3,7 @@
 Near the manifold of the constraints the state splits in two. *Along* it move the Σ o_a internal states, which
 `internal_dynamics` linearises. *Off* it, the residual ψ of a row that was differentiated ρ times obeys the error
 dynamics of the drift treatment, whatever the motion: D^ρ ψ = 0 (ρ neutral eigenvalues), Π(D - λ) ψ = 0 (the poles), or
-ψ = 0 (projection, minimal coordinates). One step multiplies a mode of eigenvalue λ by R(hλ), the method's stability
+ψ = 0 (projection). One step multiplies a mode of eigenvalue λ by R(hλ), the method's stability
 function.
 """
 
@@ -13,8 +13,7 @@ from servoctl.checks import named, positives, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.growth import linearised
 from servoctl.markup import Shown
-from servoctl.methods.choice import Poles, as_drift
-from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.choice import ORDERS, Poles, as_drift
 from servoctl.methods.stability import STEP_MAPS, amplification, stability_function
 from servoctl.model.model import Model
 from servoctl.run import Run
@@ -31,7 +30,7 @@ PER_DECADE, DECADES = 30, 7  # steps tried, below the length of the plan
 class StabilityMap(Shown):
     """The stable steps along a plan; made by `stability`.
 
-    In all methods, `method` is "RK1" to "RK8", "RK23", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau", `drift` is a
+    In all methods, `method` is "RK4", "RK8", "RK45", "DOP853", "Taylor", "RadauIIA" or "Radau", `drift` is a
     treatment as in `simulate`, and `order` is that of "Taylor" (default: the map's) and of "RadauIIA" (default: 5).
 
     Attributes
@@ -55,9 +54,9 @@ class StabilityMap(Shown):
 
         Parameters
         ----------
-        drift : None, "project", "minimal", float, `Project(...)` or `Poles(...)`, optional
+        drift : None, "project", float, `Project(...)` or `Poles(...)`, optional
             Constraint violations count where poles govern them: without treatment they are neutral under every method,
-            and projection or minimal coordinates remove them.
+            and projection removes them.
         """
         drift = as_drift(drift)
         if not isinstance(drift, Poles):

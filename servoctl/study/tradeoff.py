@@ -17,7 +17,6 @@ from servoctl.methods.choice import (
     METHODS,
     Adaptive,
     Algebraic,
-    MinimalCoordinates,
     Poles,
     Project,
     RungeKutta,
@@ -32,8 +31,7 @@ from servoctl.progress import progress_bar
 from servoctl.simulation import consistent_state, simulated
 from servoctl.study.table import SHOWN, Study, machine, table
 
-LEFT_OUT = ("RK1", "RK2", "RK23", "bounded")  # which need too many steps, or solve another problem
-MEASURED = tuple(name for name in METHODS if name not in LEFT_OUT)
+MEASURED = tuple(name for name in METHODS if name != "bounded")  # which solves another problem
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # steps of a fixed length in the span
 INSTANTS = 51  # samples of adaptive methods while they are timed
@@ -42,7 +40,7 @@ DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
 TIME_CONSTANT = 50  # default time constants of the poles in the span
-DRIFTS = ("none", "project", "minimal")  # words of the column drift; others are time constants of poles
+DRIFTS = ("none", "project")  # words of the column drift; others are time constants of poles
 CHECKS = (Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14))  # of the reference, in this order
 COSTS = ("seconds", "evaluations", "steps")
 
@@ -88,7 +86,7 @@ def bound(error, seconds):
 class TradeOff(Study):
     """Errors and costs of methods, settings and treatments of drift on one motion; made by `tradeoff`.
 
-    Columns: method; drift ("none", "project", "minimal", or the time constant of the poles in s); setting ("rtol" or
+    Columns: method; drift ("none", "project", or the time constant of the poles in s); setting ("rtol" or
     "step") and its value; error of the motion: the largest deviation from the reference over the components of the
     state, each relative to its largest magnitude (at least 1e-3 of the largest of its level), and over 402 instants
     that are the same for all methods: dense output counts, and Hermite interpolation between the steps of fixed-step
@@ -246,9 +244,9 @@ def tradeoff(
         [s]
     methods : sequence of str, optional
         Names of methods as in `simulate`; default: "algebraic" where the program determines the motion completely, so
-        that nothing is integrated, else all but "RK1", "RK2" and "RK23".
+        that nothing is integrated, else all.
     drift : sequence, optional
-        Treatments as in `simulate`; default: None, "project", "minimal" and poles at -50/(t1 - t0).
+        Treatments as in `simulate`; default: None, "project" and poles at -50/(t1 - t0).
 
     Other arguments
 
@@ -280,7 +278,7 @@ def tradeoff(
     t0, t1 = as_span(t_span)
     settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
     limit = positive("seconds", seconds)
-    drifts = (None, "project", "minimal", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
+    drifts = (None, "project", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
     combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
     total = sum(len(settings[_kind(method)]) for method, _ in combinations)
     with progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
@@ -520,7 +518,7 @@ def _drift_word(treatment):
         return repr(treatment.values)
     if isinstance(treatment, Project):
         return "project" if treatment.every == 1 else f"project {treatment.every}"
-    return "minimal" if isinstance(treatment, MinimalCoordinates) else "none"
+    return "none"
 
 
 def _text(method):

@@ -88,7 +88,6 @@ def calls():
         "RungeKutta": (sv.RungeKutta, dict(order=4, step=0.1)),
         "RadauIIA": (sv.RadauIIA, dict(order=5, step=0.1, rtol=1e-6, atol=1e-6)),
         "Adaptive": (sv.Adaptive, dict(name="RK45", rtol=1e-6, atol=1e-6)),
-        "Sundials": (sv.Sundials, dict(name="CVODES", rtol=1e-6, atol=1e-6)),
         "Project": (sv.Project, dict(every=2)),
         "Poles": (sv.Poles, dict(values=0.1)),
         "Poles row": (lambda poles: sv.simulate(s["ideal"], near, span, "RK4", drift=sv.Poles({"X": poles})),

@@ -97,7 +97,7 @@ def test_a_fast_swing_is_followed(method, stiffness, mass, swinging_cars):
     assert relative(run["reaction_x1"], spring) < 1e-6  # the first car rests: all its force is the spring's
 
 
-@pytest.mark.parametrize("method", ["RK1", "RK2", "RK4", "RK5", "RK8"])
+@pytest.mark.parametrize("method", ["RK4", "RK8"])
 def test_steps_too_long_for_a_stiff_spring_are_told(method, swinging_cars):
     model = swinging_cars.with_parameters(k1=1e9)
     with refused(sv.IntegrationStopped, method, "0.001 s", "smaller step") as caught:

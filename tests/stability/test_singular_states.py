@@ -69,7 +69,7 @@ WHEEL_STOPS = 0.6983110523  # s
 WHEEL = {"x": 0.0, "y": 0.0, "phi": 0.0, "theta": 0.0, "dphi": 1.0, "dtheta": 2.0}
 
 
-@pytest.mark.parametrize("drift", [None, "project", "minimal", 0.2])
+@pytest.mark.parametrize("drift", [None, "project", 0.2])
 @pytest.mark.parametrize("method", ["DOP853", "RK4"])
 def test_the_wheel_stops_in_every_formulation(method, drift, gallery_model):
     """The linear program passes the instant, the squared one ends there; neither goes on along the other branch."""
@@ -114,7 +114,7 @@ def pendulum(speed):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau", "Taylor", "RK4", "RadauIIA", "CVODES"])
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "Taylor", "RK4", "RadauIIA"])
 def test_a_curvature_ends_where_the_speed_does(method):
     model, reference = circling(), pendulum(2.0)
     start = model.start(x=0.0, y=0.0, dx=2.0, dy=0.0)
@@ -132,7 +132,7 @@ def test_a_curvature_ends_where_the_speed_does(method):
 # the passive arm -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["RK45", "BDF", "LSODA", "RK8"])
+@pytest.mark.parametrize("method", ["RK45", "LSODA", "RK8"])
 @pytest.mark.parametrize("drift", [None, 0.1])
 def test_the_passive_arm_stops_at_its_lost_relative_degree(method, drift):
     model = sv.derive(*passive_arm(0.5))
