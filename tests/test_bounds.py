@@ -13,8 +13,7 @@ import servoctl as sv
 from servoctl.gallery import mass_on_car
 from servoctl.methods import stability as bounds
 from servoctl.methods.accuracy import motion_error
-from servoctl.methods.choice import as_method
-from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.choice import ORDERS, as_method
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ import pytest
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.accuracy import motion_error
-from servoctl.methods.choice import as_method
-from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.choice import ORDERS, as_method
 from servoctl.methods.taylor import order_for, series_loop
 
 ERROR = 1e-9

@@ -10,8 +10,7 @@ from refusals import refused, warned
 
 import servoctl as sv
 from servoctl.gallery import gallery, mass_on_car
-from servoctl.methods.choice import as_method
-from servoctl.methods.runge_kutta import ORDERS
+from servoctl.methods.choice import ORDERS, as_method
 from servoctl.methods.stability import largest_explicit
 from servoctl.study.stability_map import MAPPED, stability
 
