@@ -660,7 +660,35 @@ def test_held_values_that_contradict_each_other_are_all_named(held, parties, nea
         held = {"hold": {name: x - value for name, value in zip("ab", held["hold"], strict=True)}}
     with refused(sv.InconsistentStart, *parties) as caught:
         model.start(**held)
-    assert caught.value.details["nearest_value"] == pytest.approx(nearest, abs=1e-9)
+    details = caught.value.details
+    assert details["nearest_value"] == pytest.approx(nearest, abs=1e-9)
+    if "hold" not in held:  # what is offered is accepted with the others
+        assert model.start(**held | {details["held"]: details["nearest_value"]}).residual < 1e-9
+
+
+def test_the_nearest_value_is_the_one_that_goes_with_the_others():
+    q = sv.coordinates("x y")
+    mechanism = sv.Mechanism(q, sv.particle(q, 1.0, ca.vertcat(*q)), actuators={"f": q["x"]})
+    model = sv.derive(mechanism, sv.Program({"sum": q["x"] + q["y"] - q.t}))
+    with refused(sv.InconsistentStart, "x = 1", "y = 1", nearest_value=-1.0):
+        model.start(x=1.0, y=1.0)
+    assert model.start(x=-1.0, y=1.0)["dx"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("by", ["output", "condition", "coordinate"])
+def test_an_output_that_is_held_at_a_standstill(by):
+    """A wheeled robot at rest has any heading; one that is held is kept, however it is named."""
+    q = sv.coordinates("x y psi")
+    (x, y, psi), (dx, dy, dpsi) = q, q.d(1)
+    robot = sv.Mechanism(
+        q, sv.rigid_body(q, 20.0, (0, 0, 1.5), position=(x, y), rates=(0, 0, dpsi)), outputs={"heading": 2 * psi},
+        actuators={"drive": (ca.cos(psi), ca.sin(psi), 0), "steer": psi},
+        constraints={"no slip": dx * ca.sin(psi) - dy * ca.cos(psi)},
+    )  # fmt: skip
+    path = sv.paths.rest_to_rest(q.t, (0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=4)
+    model = sv.derive(robot, sv.Program({"X": x - path[0], "Y": y - path[1]}))
+    held = {"output": {"heading": 0.6}, "condition": {"hold": {"angle": psi - 0.3}}, "coordinate": {"psi": 0.3}}[by]
+    assert model.start(**held)["psi"] == pytest.approx(0.3)
 
 
 def test_a_guess_that_no_state_is_near_is_printed_with_its_distance():
