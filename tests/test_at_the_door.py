@@ -226,6 +226,22 @@ def test_a_program_of_a_speed_has_the_inverse_of_its_place(damping):
         assert np.abs(slopes[0][pair] - slopes[1][pair]).max() < 1e-8 * (0.01 + np.abs(slopes[1][pair]).max())
 
 
+@pytest.mark.parametrize("damping", [0.0, 3.0])
+def test_a_cart_whose_speed_goes_on_has_the_inverse_of_its_place(damping):
+    """From rest to 1 m/s: the place is the integral of the speed, 126 u⁵ - 420 u⁶ + 540 u⁷ - 315 u⁸ + 70 u⁹."""
+    mechanism, _ = cart_and_pole("speed", damping)
+    (x, _), (dx, _), t = mechanism.q, mechanism.q.d(1), mechanism.q.t
+    u = ca.fmin(t / 1.5, 1.0)
+    place = 1.5 * (21 * u**6 - 60 * u**7 + 67.5 * u**8 - 35 * u**9 + 7 * u**10) + ca.fmax(t - 1.5, 0.0)
+    speed = sv.paths.rest_to_rest(t, 0.0, 1.0, 1.5, smoothness=4)
+    residuals = {"place": x - ca.if_else(t > 0, place, 0.0), "speed": dx - speed}
+    place, speed = (sv.inverse(mechanism, sv.Program({by: e}), (0.0, 1.5)) for by, e in residuals.items())
+    assert "inverse: bounded" in speed.message and "0 is the constant of x" in speed.message
+    for name in ("F", "x", "theta"):
+        assert np.abs(speed[name] - place[name]).max() < 1e-9 * np.abs(place[name]).max()
+    assert sv.verify(speed.model, speed).passed
+
+
 def segway(by):
     """Two wheels of 0.25 m that roll without slipping, and a body that stands on their axle."""
     q = sv.coordinates("x y psi a left right")

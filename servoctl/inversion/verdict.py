@@ -229,7 +229,7 @@ def _rests(model, states, along):
         return rest, _first_sentence(error)
     for name, t, x, around in places[: 2 if t1 != t0 else 1]:
         try:
-            end = entries.equilibrium(t, rest["start"].x if rest else x)
+            end = entries.equilibrium(t, rest["start"].x if rest else x, moving=bool(rest))
         except IntegrationStopped as error:
             why = why or f"at t = {t:.4g} s: {_first_sentence(error)}"
             continue

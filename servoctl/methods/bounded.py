@@ -155,7 +155,7 @@ class End:
     """An equilibrium: instant [s], state (n_x,), linearisation A (f, f) in the free entries, and their sizes (f,).
 
     `others` (f, r) is an orthonormal basis of the entries over their sizes without integrals, on which nothing depends:
-    those have the names `constants`.
+    those have the names `constants`, and where they move on it is a rest of the others.
     """
 
     t: float
@@ -164,6 +164,7 @@ class End:
     size: np.ndarray
     others: np.ndarray | None = None
     constants: tuple = ()
+    moving: bool = False
 
     @cached_property
     def modes(self):
@@ -299,14 +300,14 @@ class FreeEntries:
 
     # equilibria
 
-    def _quasi_static(self, t, x, continuum=False):
-        """States (n_x, N) on the invariants at which z' = 0, each by Newton's method; the nearest of a continuum."""
+    def _quasi_static(self, t, x, Q=None):
+        """States (n_x, N) on the invariants at which Qᵀz' = 0, each by Newton's method; the nearest of a continuum."""
         x, size = x.copy(), self.size[self.free]
         for _ in range(NEWTON_STEPS):
             rate, A, step, tangent = self.local(t, x)
             A, right = A * size / size[:, None], (rate / size)[:, :, None]
             try:
-                solution = np.linalg.pinv(A, CUTOFF) @ right if continuum else np.linalg.solve(A, right)
+                solution = np.linalg.solve(A, right) if Q is None else Q @ np.linalg.pinv(Q.T @ A @ Q, CUTOFF) @ Q.T @ right
             except np.linalg.LinAlgError:
                 return np.full_like(x, np.nan)
             change = step - (tangent @ (size[:, None] * solution))[:, :, 0]
@@ -316,19 +317,25 @@ class FreeEntries:
                 break
         return x
 
-    def equilibrium(self, t, x):
-        """The equilibrium that Newton's method finds from a state (n_x,); IntegrationStopped if it finds none."""
+    def equilibrium(self, t, x, moving=False):
+        """The equilibrium that Newton's method finds from a state (n_x,); IntegrationStopped if it finds none.
+
+        Where integrals may be `moving` on, one of the other entries will do.
+        """
         t, guess, size = np.array([float(t)]), np.asarray(x, dtype=float)[:, None], self.size[self.free]
-        x = self._quasi_static(t, guess, continuum=True)
-        rate, A, _, tangent = self.local(t, x)
         fastest = self._scaled(self.local(t, guess)[1]).max(initial=1.0)
-        still = np.isfinite(x).all() and np.abs(rate / size).max(initial=0.0) <= STANDS * fastest
-        # where z are no coordinates, z' = 0 for motions that do not stand still
-        if not (still and np.abs(tangent[0] * size / self.size[:, None]).max(initial=0.0) < 1 / REGULAR):
+        for Q in (np.eye(len(size)), *([self._others(guess)] if moving else [])):
+            x = self._quasi_static(t, guess, Q)
+            rate, A, _, tangent = self.local(t, x)
+            still = np.isfinite(x).all() and np.abs((rate / size) @ Q).max(initial=0.0) <= STANDS * fastest
+            # where z are no coordinates, z' = 0 for motions that do not stand still
+            if still and np.abs(tangent[0] * size / self.size[:, None]).max(initial=0.0) < 1 / REGULAR:
+                break
+        else:
             raise self._failure("Newton's method finds no equilibrium of the internal dynamics.", t[0])
-        others = self._others(x)
+        others, moving = self._others(x), Q.shape[1] < len(size)
         constants = self.free[(others**2).sum(axis=1) < 1 - CUTOFF]
-        return End(t[0], x[:, 0], A[0], size, others, tuple(self.model.state_names[i] for i in constants))
+        return End(t[0], x[:, 0], A[0], size, others, tuple(self.model.state_names[i] for i in constants), moving)
 
     def _others(self, rest):
         """An orthonormal basis (f, r) of z in its sizes without integrals: rates depend on none, or theirs alone."""
@@ -351,8 +358,9 @@ class FreeEntries:
 
     def moved(self, end, times):
         """The first of these times [s] at which an equilibrium or its linearisation is another one, or None."""
-        x = self._quasi_static(times, np.repeat(end.x[:, None], len(times), axis=1), continuum=True)
-        change = np.abs((x - end.x[:, None])[self.free] / self.size[self.free, None]).max(axis=0, initial=0.0)
+        Q = end.others if end.moving else np.eye(len(self.free))
+        x = self._quasi_static(times, np.repeat(end.x[:, None], len(times), axis=1), Q)
+        change = np.abs(Q.T @ ((x - end.x[:, None])[self.free] / self.size[self.free, None])).max(axis=0, initial=0.0)
         of_A = self._scaled(self.local(times, x)[1] - end.A).max(axis=(1, 2), initial=0.0)
         still = (change <= STANDS) & (of_A <= STANDS * self._scaled(end.A).max(initial=1.0))
         return None if still.all() else float(times[np.argmin(still)])
@@ -374,13 +382,13 @@ class Problem(FreeEntries):
         self.span, self.iterations = span, 0
         self.c, self.derivative, *_ = radau(ORDER)
         first = self.equilibrium(span[0], guess)
-        last = self.equilibrium(span[1], first.x)
+        last = self.equilibrium(span[1], first.x, moving=True)
         times = np.linspace(*span, 41)
         along = first.x[:, None] + np.linspace(0, 1, 41) * (last.x - first.x)[:, None]
-        along = self._quasi_static(times, along, continuum=first.modes is not first)
+        along = self._quasi_static(times, along, None if first.modes is first else first.others)
         self.size = component_sizes(along, state_levels(model), 1.0)
         self._choose(times, along, self.n_x - self.m)
-        self.first, self.last = (self.equilibrium(end.t, end.x) for end in (first, last))
+        self.first, self.last = (self.equilibrium(end.t, end.x, end.moving) for end in (first, last))
         self._require_splitting()
 
     def _require_splitting(self):
@@ -460,7 +468,7 @@ class Problem(FreeEntries):
         nodes = self._nodes(mesh)
         part = np.clip((nodes - self.span[0]) / (self.span[1] - self.span[0]), 0.0, 1.0)
         straight = self.first.x[:, None] + (self.last.x - self.first.x)[:, None] * part
-        x = self._quasi_static(nodes, straight, continuum=self.first.modes is not self.first)
+        x = self._quasi_static(nodes, straight, None if self.first.modes is self.first else self.first.others)
         return np.where(np.isfinite(x).all(axis=0), x, straight)
 
     def _first_mesh(self, window, knots):
