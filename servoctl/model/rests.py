@@ -32,7 +32,7 @@ class Rests:
         self.coordinates, self.nq, self.n = q.names, q.nq, q.n
         self.zero = {name: q.identity.get(name, 0.0) for name in q.names}
         self.names = (*(f"balance of {name}" for name in q.force_names), *rows)
-        mu, p, self.angles = ca.SX.sym("mu", B.shape[1]), ca.vertcat(*mechanism.parameters.symbols), None
+        mu, p = ca.SX.sym("mu", B.shape[1]), ca.vertcat(*mechanism.parameters.symbols)
         z = ca.vertcat(q.jet(0), mu)
         still = _still(q, ca.vertcat(balance - B @ mu, *rows.values()))
         moving = {f"rate of {name}": h for name, h in zip(q.names, q.h.elements(), strict=True) if not h.is_zero()}
@@ -61,10 +61,10 @@ class Rests:
         rows, slopes = (np.array(part) for part in self.function(t, z, p))
         return rows[:, 0], slopes, np.abs(rows[:, 0]) / np.maximum(np.abs(slopes) @ (1.0 + np.abs(z)), TINY)
 
-    def reached(self, t, p, q, movable=None, weights=None, some=slice(None)):
+    def reached(self, t, p, q, movable=None, weights=None, some=slice(None), angles=None):
         """[q; μ] nearest to a rest by Newton's least weighted steps, whether it is one, and its worst row.
 
-        Only some coordinates are movable, and only some rows need to vanish.
+        Only some coordinates are movable, only some rows need to vanish, and a step turns angles by a radian at most.
         """
         movable, weights = np.ones(self.nq, bool) if movable is None else movable, 1.0 if weights is None else weights
         z, weights = np.concatenate([q, np.zeros(self.function.size1_in(1) - self.nq)]), weights * np.ones(self.nq)
@@ -75,14 +75,14 @@ class Rests:
             if not np.isfinite(slopes).all() or largest >= least <= MET:
                 break
             best, least = (z, largest) if largest < least else (best, least)
-            z = z + self._step(rows, slopes, movable, weights)
+            z = z + self._step(rows, slopes, movable, weights, movable & False if angles is None else angles)
         rows, _, off = (part[some] for part in self.measured(t, best, p))
         if not len(rows):
             return best, True, None
         worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
         return best, least <= MET, (self.names[np.arange(len(self.names))[some][worst]], float(rows[worst]))
 
-    def _step(self, rows, slopes, movable, weights):
+    def _step(self, rows, slopes, movable, weights, angles):
         """The least weighted step of the coordinates that the rows ask for, whatever the forces, and these forces."""
         sizes = np.maximum(np.abs(slopes).max(axis=1), TINY)[:, None]
         of_q, of_mu = np.split(slopes / sizes, [self.nq], axis=1)
@@ -91,8 +91,7 @@ class Rests:
         step, right = np.zeros(slopes.shape[1]), -rows / sizes[:, 0]
         columns = (unforced @ of_q)[:, movable] / weights[movable]
         step[: self.nq][movable] = np.linalg.lstsq(columns, unforced @ right, rcond=RANK)[0] / weights[movable]
-        if self.angles is not None:  # a radian at most
-            step /= max(1.0, np.abs(step[: self.nq][self.angles]).max(initial=0.0))
+        step /= max(1.0, np.abs(step[: self.nq][angles]).max(initial=0.0))  # a radian at most
         step[self.nq :] = np.linalg.lstsq(of_mu, right - of_q @ step[: self.nq], rcond=RANK)[0]
         return step
 
@@ -103,19 +102,20 @@ class Rests:
         """
         first = np.array([guess.get(name, zero) for name, zero in self.zero.items()], dtype=float)
         known, movable = np.isin(self.coordinates, list(guess)), ~np.isin(self.coordinates, list(fixed))
-        self.angles = self._angles(t, p, first)
+        angles = self._angles(t, p, first)
         found, reason, sizes = [], None, None
-        for turned in self._turns(self.angles & ~known & movable):
+        for turned in self._turns(angles & ~known & movable):
             if found and 0.5 in np.abs(turned):
                 break
-            q = self._met(t, p, first + turned * np.pi, known, movable)
+            q = self._met(t, p, first + turned * np.pi, known, movable, angles)
             sizes = self._sizes(t, p, q) if sizes is None else sizes
-            z, rests, worst = self.reached(t, p, q, movable, sizes * np.where(known, GUESSED, 1.0))
+            weights = sizes * np.where(known, GUESSED, 1.0)
+            z, rests, worst = self.reached(t, p, q, movable, weights, angles=angles)
             reason = reason or worst
-            if rests and not any(self._alike(z, other) for other in found):
-                z[: self.nq] += self.angles * 2 * np.pi * np.round((first - z[: self.nq]) / (2 * np.pi))
+            if rests and not any(self._alike(z, other, angles) for other in found):
+                z[: self.nq] += angles * 2 * np.pi * np.round((first - z[: self.nq]) / (2 * np.pi))
                 found.append(z)
-        return self._ordered(t, p, found, first, known, sizes), reason
+        return self._ordered(t, p, found, first, known, angles, sizes), reason
 
     @staticmethod
     def _turns(angles):
@@ -124,10 +124,10 @@ class Rests:
         yield from np.eye(len(angles))[angles]
         yield from (k * angles for k in (1.0, 0.5, -0.5))
 
-    def _alike(self, z, other):
+    def _alike(self, z, other, angles):
         """Whether rests differ by full turns only."""
         apart = (z - other)[: self.nq]
-        apart -= self.angles * 2 * np.pi * np.round(apart / (2 * np.pi))
+        apart -= angles * 2 * np.pi * np.round(apart / (2 * np.pi))
         return bool(np.all(np.abs(apart) <= UNDECIDED * (1.0 + np.abs(other[: self.nq]))))
 
     def _angles(self, t, p, q):
@@ -139,12 +139,12 @@ class Rests:
         whole, other = (np.abs(np.subtract(some, changed[0])).max(axis=1, initial=0.0) for some in changed[1:])
         return whole < UNDECIDED * other
 
-    def _met(self, t, p, q, known, movable):
+    def _met(self, t, p, q, known, movable, angles):
         """q on the constraints and the program, moved by the actuators, by what nobody guessed, at last by anything."""
         V, _, E = (np.array(part) for part in self._frame(t, q, p))
         driven, first = np.abs(V @ E).max(axis=1, initial=0.0) > 0, q
         for some in (movable & driven, movable & ~known, movable):
-            z, there, _ = self.reached(t, p, q if some is movable else first, some, some=slice(self.n, None))
+            z, there, _ = self.reached(t, p, q if some is movable else first, some, 1.0, slice(self.n, None), angles)
             q = z[: self.nq]
             if there:
                 break
@@ -158,12 +158,12 @@ class Rests:
         heavy = np.isfinite(sizes) & (sizes > 0)
         return np.where(heavy, sizes, sizes[heavy].min(initial=np.inf) if heavy.any() else 1.0)
 
-    def _ordered(self, t, p, found, first, known, sizes):
+    def _ordered(self, t, p, found, first, known, angles, sizes):
         """The rest to take, and others that are as near to the guess."""
         if not found:
             return []
         away = [(z[: self.nq] - first) * sizes for z in found]
-        lists = [[np.linalg.norm(a[some]) for a in away] for some in (known, self.angles & ~known, ~known)]
+        lists = [[np.linalg.norm(a[some]) for a in away] for some in (known, angles & ~known, ~known)]
         guessed, turned, far = map(np.array, lists)
         near = np.flatnonzero(_smallest(guessed))
         left = near[_smallest(turned[near])]
