@@ -5,6 +5,8 @@ also in `details`.
 """
 
 import re
+import sys
+import warnings
 
 DERIVATIVE = re.compile(r"d([2-9]?)([A-Za-z_]\w*)")  # dx, d2x: names that may be those of derivatives
 
@@ -105,3 +107,11 @@ def _next_derivative(name, valid):
     order, base = int(found[1] or 1), found[2]
     orders = {base: 0, f"d{base}": 1} | {f"d{k}{base}": k for k in range(2, order)}
     return min((other for other in valid if other in orders), key=lambda other: order - orders[other], default=None)
+
+
+def warn(text):
+    """Warn the first caller outside the package."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, RuntimeWarning, stacklevel=level)

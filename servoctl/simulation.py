@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span
-from servoctl.errors import InconsistentStart, ServoError, SpecificationError
+from servoctl.errors import InconsistentStart, ServoError, SpecificationError, warn
 from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, quiet_by_series
 from servoctl.methods.accuracy import (
     ATOL,
@@ -46,7 +46,7 @@ from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.sizes import sizes_of, state_levels
-from servoctl.methods.stability import run_checked, warn, warn_drifted, warn_many_steps, warn_unstable
+from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
 from servoctl.model.model import Model

@@ -13,6 +13,7 @@ from servoctl.errors import (
     ServoError,
     SingularProgram,
     SpecificationError,
+    warn,
 )
 from servoctl.inversion.relaxed import relaxed
 from servoctl.inversion.report import extremes
@@ -32,7 +33,6 @@ from servoctl.inversion.verdict import (
     verdict_with,
 )
 from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
-from servoctl.methods.stability import warn
 from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.plant import plant

@@ -307,7 +307,10 @@ class FreeEntries:
             rate, A, step, tangent = self.local(t, x)
             A, right = A * size / size[:, None], (rate / size)[:, :, None]
             try:
-                solution = np.linalg.solve(A, right) if Q is None else Q @ np.linalg.pinv(Q.T @ A @ Q, CUTOFF) @ Q.T @ right
+                if Q is None:
+                    solution = np.linalg.solve(A, right)
+                else:
+                    solution = Q @ np.linalg.pinv(Q.T @ A @ Q, CUTOFF) @ Q.T @ right
             except np.linalg.LinAlgError:
                 return np.full_like(x, np.nan)
             change = step - (tangent @ (size[:, None] * solution))[:, :, 0]

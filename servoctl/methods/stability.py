@@ -1,7 +1,5 @@
 """Stability of integration and of sampled feedback: how fast a pole may be, and whether steps resolve a motion."""
 
-import sys
-import warnings
 from functools import cache
 from itertools import pairwise
 from math import comb, factorial, inf, pi
@@ -9,7 +7,7 @@ from math import comb, factorial, inf, pi
 import numpy as np
 
 from servoctl.checks import MOST_JETS, is_whole, named, whole_of
-from servoctl.errors import SpecificationError
+from servoctl.errors import SpecificationError, warn
 from servoctl.methods.accuracy import component_sizes
 from servoctl.methods.choice import ORDERS, Poles
 from servoctl.methods.motion import breakpoints, equal_steps
@@ -320,11 +318,3 @@ def _fastest_rate(stepping, t, x, direction, size):
         ahead = stepping.rates(t, x + size * direction) - stepping.rates(t, x)
         direction, rate = ahead / size, float(np.abs(ahead / size).max() / NUDGE)
     return rate
-
-
-def warn(text):
-    """Warn the first caller outside the package."""
-    level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] == __name__.split(".")[0]:
-        level, frame = level + 1, frame.f_back
-    warnings.warn(text, RuntimeWarning, stacklevel=level)
