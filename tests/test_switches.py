@@ -292,11 +292,11 @@ def test_a_jump_without_a_switch_is_found(method, drift):
 def test_coarse_steps_are_no_jump():
     """A circle by steps of which each errs by far more than a tolerance: the user's choice."""
     model, start = ideal(lambda t, x, y, dx, dy: x**2 + y**2 - 1, x=1.0, y=0.0, dy=1.0)
-    for order, step in ((4, 0.2), (8, 0.8)):
-        run = sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step))
+    for step in (0.2, 0.4):
+        run = sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(4, step=step))
         assert run.success and np.abs(run.residual["p"][0]).max() > 1e-6
         for drift in ("project", sv.Project(5)):
-            assert sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(order, step=step), drift=drift).success
+            assert sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(4, step=step), drift=drift).success
 
 
 def test_a_first_step_as_long_as_the_span_is_not_believed(gallery_model):
