@@ -145,7 +145,7 @@ SCENES = {  # scenes in plain coordinates, each through one change
     "flexible-joint": ({"q": np.pi}, {}), "rotary-crane": ({"beta": 0.3}, {}),
     "mass-on-car": ({}, {"x1": 1e-3, "s": 1e-3}), "pendubot": ({"q1": np.pi / 2}, {}),
     "vtol-centre": ({"theta": 0.3}, {"z": 1e3}), "double-pendulum": ({"x": -10.0}, {"x": -1.0}),
-    "cart-pole": ({"x": 1.0, "theta": 6.0}, {}),
+    "cart-pole": ({"x": 1.0, "theta": 6.0}, {}), "slung-load": ({"x": -10.0, "z": -10.0}, {}),
     "furuta-pendulum": ({"phi": 6.0}, {}), "ball-and-beam": ({"r": -1.0}, {"r": 1e-3}),
     "two-link-arm": ({"q1": np.pi, "q2": 0.3}, {}), "winch-crane": ({"x": 1.0}, {"x": 1e-3}),
 }  # fmt: skip
