@@ -167,3 +167,12 @@ def test_scenes_need_the_same_forces_in_other_coordinates(name):
         )
     assert plans[1].model.flat == plans[0].model.flat
     assert same(*plans, FLAT if plans[0].model.flat else INTEGRATED)
+
+
+@pytest.mark.parametrize("shift", [10.0, 100.0])
+def test_a_program_is_flat_wherever_its_pivots_were_chosen(shift):
+    """Those of an aircraft derived far from its path vanish where it hovers; "singular at rest", said the verdict."""
+    mechanism, program = gallery["vtol"].build()
+    machine, residuals, _ = moved(mechanism, program, {"x": shift, "z": shift})
+    plans = [sv.inverse(*built, (0.0, 4.0)) for built in ((mechanism, program), (machine, residuals))]
+    assert plans[1].method == "algebraic" and same(*plans, FLAT)
