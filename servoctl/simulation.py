@@ -435,7 +435,7 @@ def _stepping(model, method, drift, span, bar, atol):
             return SundialsSteps(model, name, drift, rtol, given or least, t1 - t0, bar)
         case Adaptive(name, rtol, given):
             each = least if atol is None or isinstance(drift, MinimalCoordinates) else atol
-            return ScipySteps(model, name, drift, rtol, given or each, bar)
+            return ScipySteps(model, name, drift, rtol, given or each, bar, getattr(method, "for_stiff", None))
 
 
 def _fitting_tolerances(model, method, motion, t0):

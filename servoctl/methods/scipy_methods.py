@@ -5,6 +5,7 @@ import numpy as np
 from servoctl.methods.bulk import BulkSteps, Steps, differentiated
 from servoctl.methods.choice import MinimalCoordinates, Project
 from servoctl.methods.minimal import Chart, MinimalSolver, Sizes
+from servoctl.methods.taylor import leave_if_stiff
 from servoctl.methods.watch import edge
 from servoctl.values import frozen
 
@@ -56,12 +57,14 @@ class ScipySteps(BulkSteps):
     drift : None, Poles, Project or MinimalCoordinates
     rtol, atol : float
     progress : callable
+    for_stiff : Method, optional
+        To which the motion is left where stability limits the steps.
     """
 
     advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."
 
-    def __init__(self, model, method, drift, rtol, atol, progress):
-        self.tolerances = rtol, atol
+    def __init__(self, model, method, drift, rtol, atol, progress, for_stiff=None):
+        self.tolerances, self.for_stiff = (rtol, atol), for_stiff
         self.sizes = Sizes(model) if isinstance(drift, MinimalCoordinates) else None
         self.projects = isinstance(drift, Project)
         super().__init__(model, method, drift, progress)
@@ -119,6 +122,8 @@ class ScipySteps(BulkSteps):
                 self._project()
             t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
+        if len(dense) == AT_ONCE:
+            leave_if_stiff(self, self.for_stiff, 1.0, np.array(t), x[-1])  # a mode that decays within each step
         self.most = min(2 * self.most, AT_ONCE) if self.sizes is None else 1
         self._count(len(dense))
         if not self.failure and self._creeps(len(dense)):
