@@ -176,3 +176,12 @@ def test_a_program_is_flat_wherever_its_pivots_were_chosen(shift):
     machine, residuals, _ = moved(mechanism, program, {"x": shift, "z": shift})
     plans = [sv.inverse(*built, (0.0, 4.0)) for built in ((mechanism, program), (machine, residuals))]
     assert plans[1].method == "algebraic" and same(*plans, FLAT)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_rest_after_a_path_is_where_the_path_ends(unit):
+    """Newton's method took steps of one unit at most, 40 in all: 40 mm of 5 m."""
+    machine, program, names = moved(*gallery["vtol-centre"].build(), scales={"x": unit, "z": unit})
+    model = sv.derive(machine, program)
+    rest = sv.report(model, model.start()).basis.rest["end"]
+    assert (unit * rest.x[:2]).tolist() == pytest.approx([5.0, 2.0], rel=1e-12)
