@@ -430,7 +430,7 @@ def _stepping(model, method, drift, span, bar, atol):
             return RungeKuttaSteps(model, str(method), drift, _step_length(step, t0, t1), bar)
         case Adaptive(name, rtol, given):
             each = least if atol is None else atol
-            return ScipySteps(model, name, drift, rtol, given or each, bar)
+            return ScipySteps(model, name, drift, rtol, given or each, bar, getattr(method, "for_stiff", None))
 
 
 def _fitting_tolerances(model, method, motion, t0):

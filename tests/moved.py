@@ -1,5 +1,7 @@
 """The same machine in other coordinates: other origins, zeros of angles, units, axes and names."""
 
+from functools import partial
+
 import casadi as ca
 
 import servoctl as sv
@@ -9,31 +11,37 @@ def moved(mechanism, program, shifts=None, scales=None, reverse=False):
     """A mechanism and a program in coordinates x of which the old ones are scale x + shift, by name; reversed names.
 
     Generalised forces of x are those of the old coordinates times their scales, so that actuators keep their units.
+    Quasi-velocities stay what they are, with the old names.
     """
-    q = mechanism.q
-    assert q.plain
+    q, count = mechanism.q, mechanism.q.n
     names = [f"{'zyxwvutsrq'[i] if reverse else 'n'}{name}" for i, name in enumerate(q.names)]
-    order = sorted(range(q.n), key=lambda i: names[i]) if reverse else range(q.n)
-    new = sv.coordinates(" ".join(names[i] for i in order))
-    place = [list(order).index(i) for i in range(q.n)]
-    s = ca.SX([(scales or {}).get(name, 1.0) for name in q.names])
-    old, known = [q.t], [new.t]
-    for k in range(5):
-        jet = new.jet(k)[place]
-        old.append(q.jet(k))
-        known.append(s * jet + (ca.SX([(shifts or {}).get(name, 0.0) for name in q.names]) if k == 0 else 0))
-    symbols = ca.vertcat(*old), ca.vertcat(*known)
+    order = sorted(range(q.nq), key=lambda i: names[i]) if reverse else list(range(q.nq))
+    place = [order.index(i) for i in range(q.nq)]
+    s, c = (ca.SX([(some or {}).get(name, float(k)) for name in q.names]) for some, k in ((scales, 1), (shifts, 0)))
+    bare = sv.coordinates(" ".join(names[i] for i in order))
 
-    def there(expression):
-        return ca.substitute(ca.SX(expression), *symbols)
+    def there(expression, new=bare, jets=0):
+        old = ca.vertcat(q.t, *(q.jet(k) for k in range(jets + 1)))
+        known = [s * new.jet(k)[place] if q.plain else new.jet(k) for k in range(1, jets + 1)]
+        return ca.substitute(ca.SX(expression), old, ca.vertcat(new.t, s * new.jet(0)[place] + c, *known))
 
-    balance = (s * there(mechanism.balance))[list(order)]
-    actuators = {name: (s * there(mechanism.E[:, j]))[list(order)] for j, name in enumerate(mechanism.actuators)}
+    new, factors, rows = bare, s, order
+    if not q.plain:
+        V, h = ((there(part) / ca.repmat(s, 1, part.shape[1]))[order, :] for part in (q.V, q.h))
+        invariants = {name: there(e) for name, e in q.invariants.items()}
+        new = bare.with_quasi_velocities(" ".join(q.velocity_names), V, h, invariants)
+        factors, rows = ca.SX.ones(count), list(range(count))
+    new.identity = {names[q.names.index(name)]: value for name, value in q.identity.items()}
+    of = partial(there, new=new, jets=4)
+    actuators = {name: (factors * of(mechanism.E[:, j]))[rows] for j, name in enumerate(mechanism.actuators)}
     others = {"constraints": mechanism.constraints, "outputs": mechanism.outputs}
-    others = {what: {name: there(e) for name, e in some.items()} for what, some in others.items()}
+    others = {what: {name: of(e) for name, e in some.items()} for what, some in others.items()}
+    balance = (factors * of(mechanism.balance))[rows]
     machine = sv.Mechanism(new, balance=balance, actuators=actuators, parameters=mechanism.parameters, **others)
-    residuals = {name: there(e) for name, e in program.residuals.items()}
-    return machine, sv.Program(residuals, by=program.by), dict(zip(q.names, names, strict=True))
+    chosen = ({name: of(e) if isinstance(e, ca.SX) else e for name, e in some.items()}
+              for some in (program.residuals, program.weights, program.toward))  # fmt: skip
+    velocities = {} if q.plain else {name: name for name in q.velocity_names}
+    return machine, program.again(*chosen), dict(zip(q.names, names, strict=True)) | velocities
 
 
 def values(known, names, shifts, scales):

@@ -11,6 +11,7 @@ import servoctl as sv
 from servoctl.errors import LimitExceeded, SpecificationError
 from servoctl.gallery import gallery
 from servoctl.methods import accuracy as rule
+from servoctl.methods import choice
 from servoctl.methods.choice import as_method
 from servoctl.shell.main import main
 
@@ -217,3 +218,15 @@ def test_stiff_motions_are_integrated_implicitly(damping, stiffness, end, method
         assert "stability, not accuracy, limits the steps of Taylor" in plain.message
         explicit = sv.simulate(model, run.state(0.0), (0.0, end), sv.Taylor(rtol=1e-9, atol=1e-9), drift="project")
         assert explicit.counters["steps"] > 10 * run.counters["steps"]
+
+
+@pytest.mark.parametrize("largest", [0, 300])
+def test_stiff_defaults_need_neither_series_nor_a_compiler(backend, largest, monkeypatch):
+    """Without a compiler the default once ended with "method='RadauIIA' was given"; large equations stayed explicit."""
+    monkeypatch.setattr(choice, "LARGE_FOR_SERIES", largest)
+    model = damped(1e3, 1.0)
+    run = sv.simulate(model, model.start(y=0.1, dy=0.0), (0.0, 10.0))
+    assert run.method == {"c": "RadauIIA", "casadi": "Radau"}[backend]
+    assert f"limits the steps of {'Taylor' if largest else 'DOP853'}" in run.message
+    expected = elongation(run.t, 1e3, 1.0, 0.1)
+    assert np.abs(run["y"] - expected).max() <= 1e-6 * np.abs(expected).max()

@@ -145,7 +145,7 @@ SCENES = {  # scenes in plain coordinates, each through one change
     "flexible-joint": ({"q": np.pi}, {}), "rotary-crane": ({"beta": 0.3}, {}),
     "mass-on-car": ({}, {"x1": 1e-3, "s": 1e-3}), "pendubot": ({"q1": np.pi / 2}, {}),
     "vtol-centre": ({"theta": 0.3}, {"z": 1e3}), "double-pendulum": ({"x": -10.0}, {"x": -1.0}),
-    "cart-pole": ({"x": 1.0, "theta": 6.0}, {}),
+    "cart-pole": ({"x": 1.0, "theta": 6.0}, {}), "slung-load": ({"x": -10.0, "z": -10.0}, {}),
     "furuta-pendulum": ({"phi": 6.0}, {}), "ball-and-beam": ({"r": -1.0}, {"r": 1e-3}),
     "two-link-arm": ({"q1": np.pi, "q2": 0.3}, {}), "winch-crane": ({"x": 1.0}, {"x": 1e-3}),
 }  # fmt: skip
@@ -167,3 +167,21 @@ def test_scenes_need_the_same_forces_in_other_coordinates(name):
         )
     assert plans[1].model.flat == plans[0].model.flat
     assert same(*plans, FLAT if plans[0].model.flat else INTEGRATED)
+
+
+@pytest.mark.parametrize("shift", [10.0, 100.0])
+def test_a_program_is_flat_wherever_its_pivots_were_chosen(shift):
+    """Those of an aircraft derived far from its path vanish where it hovers; "singular at rest", said the verdict."""
+    mechanism, program = gallery["vtol"].build()
+    machine, residuals, _ = moved(mechanism, program, {"x": shift, "z": shift})
+    plans = [sv.inverse(*built, (0.0, 4.0)) for built in ((mechanism, program), (machine, residuals))]
+    assert plans[1].method == "algebraic" and same(*plans, FLAT)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_rest_after_a_path_is_where_the_path_ends(unit):
+    """Newton's method took steps of one unit at most, 40 in all: 40 mm of 5 m."""
+    machine, program, names = moved(*gallery["vtol-centre"].build(), scales={"x": unit, "z": unit})
+    model = sv.derive(machine, program)
+    rest = sv.report(model, model.start()).basis.rest["end"]
+    assert (unit * rest.x[:2]).tolist() == pytest.approx([5.0, 2.0], rel=1e-12)

@@ -139,7 +139,7 @@ def _of_motion(model, motion):
         return Verdict(SINGULAR, _first_sentence(error))
     except ServoError as error:
         return Verdict(OPEN, f"no start was found: {_first_sentence(error)}", "pass model.start(...) or a run")
-    lost = [reason for t, x in states if (reason := _lost_rank(_derived_for(model, motion, t), t, x))]
+    lost = [reason for t, x in states if (reason := _lost_rank(_derived_for(model, motion, t, x), t, x))]
     if lost:
         return Verdict(SINGULAR, lost[0])
     if model.flat:
@@ -193,11 +193,11 @@ def endpoints(model, motion):
         return []
 
 
-def _derived_for(model, motion, t):
-    """The model with the pivots that a run has at an instant."""
-    if not isinstance(motion, Run):
-        return model
-    return motion.variant(int(np.argmin(np.abs(motion.t - t)))) or model
+def _derived_for(model, motion, t, x):
+    """The model with the pivots that a run has at an instant, or a start needs."""
+    if isinstance(motion, Run):
+        return motion.variant(int(np.argmin(np.abs(motion.t - t)))) or model
+    return model.there(t, np.append(x, np.zeros(model.n)))
 
 
 def _lost_rank(model, t, x):

@@ -14,7 +14,7 @@ import numpy as np
 
 from servoctl.checks import is_number
 from servoctl.errors import IntegrationStopped, LimitExceeded, SpecificationError
-from servoctl.methods.choice import Adaptive, Algebraic, Automatic, Project, RadauIIA, Taylor
+from servoctl.methods.choice import Adaptive, Algebraic, Automatic, Project, Taylor
 from servoctl.methods.sizes import motion_sizes, state_levels
 from servoctl.methods.taylor import order_for
 
@@ -197,7 +197,7 @@ def accurate(simulated, model, accuracy, method=None, drift=None):
     if isinstance(method, Algebraic):
         return simulated(method, None)
     method, run = _with_fallback(simulated, method)
-    if run.method == str(RadauIIA()):
+    if run.method == str(getattr(method, "for_stiff", None)):
         method = method.for_stiff
     if not run.success:
         return run

@@ -314,7 +314,7 @@ class FreeEntries:
             except np.linalg.LinAlgError:
                 return np.full_like(x, np.nan)
             change = step - (tangent @ (size[:, None] * solution))[:, :, 0]
-            largest = np.abs(change / self.size).max(axis=1, initial=0.0)
+            largest = np.abs(change / (self.size + np.abs(x.T))).max(axis=1, initial=0.0)
             x += (change * np.minimum(1.0, 1.0 / np.maximum(largest, 1e-300))[:, None]).T
             if not largest.max(initial=0.0) > NEWTON_ENDS:
                 break

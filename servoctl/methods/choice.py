@@ -16,6 +16,7 @@ from servoctl.checks import (
     tolerance,
     whole_of,
 )
+from servoctl.codegen.compiler import compiler
 from servoctl.errors import SpecificationError, unknown
 from servoctl.values import frozen
 
@@ -360,15 +361,24 @@ class Automatic(Taylor):
     def __str__(self):
         return "Taylor"
 
-    @property
-    def for_stiff(self):
-        """What goes on where stability limits the steps; None where jets are required, which only series give."""
-        return RadauIIA(rtol=self.rtol, atol=self.atol) if self.jets is None else None
+    for_stiff = property(lambda self: _implicit(self) if self.jets is None else None)  # only series give jets
 
     @property
     def without_series(self):
         """What goes on where pivots change or the equations are no series; None for an order that is required."""
         return Adaptive(rtol=self.rtol, atol=self.atol) if self.jets is None and self.order is None else None
+
+
+@frozen(repr=False)
+class AutomaticAdaptive(Adaptive):
+    """DOP853 as a default, in whose place another method takes stiff equations."""
+
+    for_stiff = property(lambda self: _implicit(self))
+
+
+def _implicit(method):
+    """The implicit method with the tolerances of another one: its loop is C code, or scipy's without a compiler."""
+    return RadauIIA(rtol=method.rtol, atol=method.atol) if compiler() else Adaptive("Radau", method.rtol, method.atol)
 
 
 _FAMILIES = ((RungeKutta, ORDERS.values()), (Adaptive, SCIPY))
@@ -423,7 +433,7 @@ def default_method(model, drift=None):
     if model.flat:
         return Algebraic()
     series = type(drift) not in Taylor.refused and model.function("ode").operations <= LARGE_FOR_SERIES
-    return Automatic() if series else Adaptive()
+    return Automatic() if series else AutomaticAdaptive()
 
 
 def require_combination(model, method, drift):

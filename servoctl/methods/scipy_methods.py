@@ -4,6 +4,7 @@ import numpy as np
 
 from servoctl.methods.bulk import BulkSteps, Steps, differentiated
 from servoctl.methods.choice import Project
+from servoctl.methods.taylor import leave_if_stiff
 from servoctl.methods.watch import edge
 from servoctl.values import frozen
 
@@ -47,12 +48,14 @@ class ScipySteps(BulkSteps):
     drift : None, Poles or Project
     rtol, atol : float
     progress : callable
+    for_stiff : Method, optional
+        To which the motion is left where stability limits the steps.
     """
 
     advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."
 
-    def __init__(self, model, method, drift, rtol, atol, progress):
-        self.tolerances = rtol, atol
+    def __init__(self, model, method, drift, rtol, atol, progress, for_stiff=None):
+        self.tolerances, self.for_stiff = (rtol, atol), for_stiff
         self.projects = isinstance(drift, Project)
         super().__init__(model, method, drift, progress)
 
@@ -103,6 +106,8 @@ class ScipySteps(BulkSteps):
                 self._project()
             t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
+        if len(dense) == AT_ONCE:
+            leave_if_stiff(self, self.for_stiff, 1.0, np.array(t), x[-1])  # a mode that decays within each step
         self.most = min(2 * self.most, AT_ONCE)
         self._count(len(dense))
         if not self.failure and self._creeps(len(dense)):

@@ -386,20 +386,20 @@ class Unsuited(Exception):
         self.method = method
 
 
-def limited_by_stability(model, order, t, x, span):
-    """Whether stability limits the steps of a series with the ends t (S + 1,) [s], the last one at the state x (n_x,).
+def leave_if_stiff(steps, method, limit, t, x):
+    """Leave a motion to a method where stability, of decaying modes up to |hλ| = limit, limits its steps.
 
-    A series of order p damps a mode of rate λ on the negative real axis for steps up to about p/(e |λ|).
+    These have the ends t (S + 1,) [s], and lead to x (n_x,). A series of order p has a limit of about p/e.
     """
-    step = (t[-1] - t[0]) / (len(t) - 1)
-    if abs(span) < STIFF_STEPS * abs(step):
-        return False
-    jacobian = model.function("ode_jacobian")(t[-1], x, model.parameters).reshape(len(x), len(x))
-    if not np.isfinite(jacobian).all():
-        return False
-    decay = np.linalg.eigvals(jacobian * np.sign(step))
+    step = abs(t[-1] - t[0]) / (len(t) - 1)
+    if method is None or abs(steps.watch.span) < STIFF_STEPS * step:
+        return
+    jacobian = steps.model.function("ode_jacobian")(t[-1], x, steps.model.parameters).reshape(len(x), len(x))
+    decay = np.linalg.eigvals(jacobian * np.sign(t[-1] - t[0])) if np.isfinite(jacobian).all() else np.zeros(1)
     fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
-    return bool(LIMITED * abs(step) * fastest * np.e > order)
+    if LIMITED * step * fastest > limit:
+        why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
+        raise Unsuited(why, method)
 
 
 class TaylorSteps(Stepping):
@@ -529,7 +529,8 @@ class TaylorSteps(Stepping):
             a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
             if steps == self.most:
-                self._leave_if_stiff(t, x)
+                order = self.last - self.top + 1
+                leave_if_stiff(self, getattr(self.settings, "for_stiff", None), order / np.e, t, x)
             if not fine:
                 self._follow(outcome)
             elif failed:
@@ -538,13 +539,6 @@ class TaylorSteps(Stepping):
             row = np.concatenate([[a], x, self._outputs(a, x)])
             self._sample(_Log(self.f, self.n_x, self._on_branch(a), np.array([row, row])), times, a)
         return a, x
-
-    def _leave_if_stiff(self, t, x):
-        """Leave the motion to an implicit method if stability limits steps with the ends t (S + 1,) [s]."""
-        method, order = getattr(self.settings, "for_stiff", None), self.last - self.top + 1
-        if method is not None and limited_by_stability(self.model, order, t, x, self.watch.span):
-            why = f"stability, not accuracy, limits the steps of {self.method} to {abs(t[-1] - t[-2]):.2g} s"
-            raise Unsuited(why, method)
 
     def _doubt(self, t):
         """Leave the motion to an adaptive method if its series have often missed the equations."""

@@ -41,7 +41,7 @@ from servoctl.reduction.samples import warn_of_samples
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.tolerances import ENTRY
+from servoctl.tolerances import ENTRY, RESOLVED
 from servoctl.values import read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
@@ -267,6 +267,13 @@ class Model(Detailed):
         numbers = self.parameters, self._knots, near._functions, self._variants
         self._keep(key, Model(near.reduction, near._store, *numbers))
         return self._variants[key]
+
+    def there(self, t, jets):
+        """The model, or where its pivots vanish at t [s] and jets (n_z,) the one with pivots chosen there, if any."""
+        try:
+            return self if self.strength(t, jets) > RESOLVED else self.near(t, jets)
+        except ServoError:
+            return self
 
     def _derived_near(self, place):
         r = self.reduction

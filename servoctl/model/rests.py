@@ -140,11 +140,12 @@ class Rests:
         return whole < UNDECIDED * other
 
     def _met(self, t, p, q, known, movable, angles):
-        """q on the constraints and the program, moved by the actuators, by what nobody guessed, at last by anything."""
+        """q on the constraints and the program by actuators, by what nobody guessed, by anything; lengths first."""
         V, _, E = (np.array(part) for part in self._frame(t, q, p))
-        driven, first = np.abs(V @ E).max(axis=1, initial=0.0) > 0, q
-        for some in (movable & driven, movable & ~known, movable):
-            z, there, _ = self.reached(t, p, q if some is movable else first, some, 1.0, slice(self.n, None), angles)
+        driven, lengths, first = np.abs(V @ E).max(axis=1, initial=0.0) > 0, ~angles, q
+        for some in (driven & lengths, ~known & lengths, driven, ~known, movable):
+            near = q if some is movable else first
+            z, there, _ = self.reached(t, p, near, movable & some, 1.0, slice(self.n, None), angles)
             q = z[: self.nq]
             if there:
                 break

@@ -1,6 +1,5 @@
 """Consistent starts: held values exact, every invariant satisfied, the rest as near its guess as possible."""
 
-from contextlib import suppress
 from copy import copy
 from dataclasses import field, replace
 from math import factorial
@@ -14,7 +13,6 @@ from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
 from servoctl.model.rests import GUESSED, Rests
 from servoctl.spec.mechanism import require_known
-from servoctl.tolerances import RESOLVED
 from servoctl.values import Value, frozen
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
@@ -240,9 +238,8 @@ def _rests(model, equations, aim, held, conditions):
     found, _ = rests.nearest(t, model.parameters, guess, held.keys() - rates)
     states = [np.concatenate([z[: q.nq], np.zeros(len(aim.names) - q.nq)]) for z in found]
     jets = np.append(states[0][: len(model.state_names)], np.zeros(model.n)) if states else None
-    if states and not _largest(equations, states[0]) < TOLERANCE and model.strength(t, jets) <= RESOLVED:
-        with suppress(ServoError):  # a pivot of the model vanishes there
-            equations = JetEquations(model.near(t, jets), t, conditions)
+    if states and not _largest(equations, states[0]) < TOLERANCE:
+        equations = JetEquations(model.there(t, jets), t, conditions)
     states = [x for x in states if _largest(equations, x) < TOLERANCE and _stays(model, t, x)]
     others = [x for x in states[1:] if not _clear_choice(states[0], x, aim, model)]
     return (equations, np.array([states[0], *others])) if states else None
