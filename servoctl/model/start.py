@@ -12,7 +12,7 @@ from servoctl.checks import column, finite, mapping, named
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
-from servoctl.model.rests import GUESSED, Rests
+from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
 from servoctl.spec.mechanism import require_known
 from servoctl.tolerances import RESOLVED
 from servoctl.values import Value, frozen
@@ -166,24 +166,31 @@ def _numeric(f):
 
 @frozen(eq=False)
 class Aim:
-    """The state nearest to a reference is sought, by weights, with some values movable; arrays (n_x,)."""
+    """The state nearest to a reference is sought, by sizes and most of all in guessed values; arrays (n_x,)."""
 
     names: tuple
     reference: np.ndarray
-    weights: np.ndarray
+    sizes: np.ndarray
+    guessed: np.ndarray
     movable: np.ndarray
 
     @property
-    def guessed(self):
-        """Which values are guessed."""
-        return self.weights > 1.0
+    def weights(self):
+        """By which a distance of values from the reference counts."""
+        return np.where(self.guessed, GUESSED, 1.0) * self.sizes
 
     @classmethod
     def of(cls, names, guess, held, identity):
         """The state nearest to guessed values, with held ones; where neither says more, to zero or the identity's."""
         reference = np.array([held.get(name, guess.get(name, identity.get(name, 0.0))) for name in names])
-        weights = np.array([GUESSED if name in guess and name not in held else 1.0 for name in names])
-        return cls(names, reference, weights, np.array([name not in held for name in names]))
+        movable = np.array([name not in held for name in names])
+        return cls(names, reference, np.ones(len(names)), movable & np.isin(names, list(guess)), movable)
+
+    def weighed(self, model, t):
+        """Distances of coordinates and of velocities by the kinetic energy, and so those of higher derivatives."""
+        measured = model.once("frame", lambda: frame(model.reduction.mechanism))
+        of_q, of_w = roots_of_inertia(measured, t, self.reference[: model.nq], model.parameters)
+        return replace(self, sizes=np.append(of_q, np.resize(of_w, len(self.names) - model.nq)))
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the equations
@@ -195,7 +202,7 @@ def consistent(model, t, held, guess, hold):
     chosen = guess | values
     q, rows = model.reduction.mechanism.q, model.reduction.mechanism.followers | conditions
     equations = JetEquations(model, t, rows)
-    aim = Aim.of(equations.names, guess, values, q.identity)
+    aim = Aim.of(equations.names, guess, values, q.identity).weighed(model, t)
     for e in (list(places) for places, _ in q.spheres):
         if not aim.reference[e].any() and {*chosen} & {q.names[i] for i in e}:
             raise SpecificationError(
@@ -305,9 +312,8 @@ def _solved(model, equations, aim, conditions, held):
     equations, x, residual = _solve(model, equations, aim, conditions)
     if not residual < TOLERANCE:
         _refuse(equations, aim, held, x)
-    free = free_names(equations, x, aim, {aim.names[i] for i in np.flatnonzero(aim.guessed)})
-    x = _at_guess(equations, x, aim, aim.guessed & np.isin(aim.names, free))
-    sought = aim.movable & ~np.isin(aim.names, free)
+    x = _by_levels(equations, x, aim, model)
+    sought = aim.movable & ~np.isin(aim.names, free_names(equations, x, aim, set(np.array(aim.names)[aim.guessed])))
     return equations, _branches(equations, x, replace(aim, movable=sought), model)
 
 
@@ -323,14 +329,24 @@ def _by_blocks(model, t, equations, aim):
     return x, _largest(equations, x)
 
 
-def _at_guess(equations, x, aim, guessed):
-    """A consistent state with all guessed values, else with those (n_z,) among them that are free, else x."""
-    for kept in (aim.guessed, guessed):
-        first = np.where(kept, aim.reference, x)
-        moved = gauss_newton(equations, first, replace(aim, movable=aim.movable & ~kept)) if kept.any() else x
-        if _largest(equations, moved) < TOLERANCE:
-            return moved
+def _by_levels(equations, x, aim, model):
+    """The state near x that is nearest to the reference in coordinates, then in each derivative; first in guesses."""
+    levels, movable = _levels(model, len(x)), aim.movable
+    for level in range(levels[-1] + 1):
+        for some in (movable & aim.guessed & (levels == level), movable & (levels == level)):
+            movable = movable & ~some
+            kept = gauss_newton(equations, np.where(some, aim.reference, x), replace(aim, movable=movable))
+            if not _largest(equations, kept) < TOLERANCE:
+                open_ = movable | some
+                reference = np.where(open_, aim.reference, x)
+                kept = _nearest(equations, x, replace(aim, reference=reference, guessed=some, movable=open_))
+            x = kept if _largest(equations, kept) < TOLERANCE else x
     return x
+
+
+def _levels(model, size):
+    """The derivative that each of the first jets is."""
+    return np.maximum(0, np.arange(size) - model.nq + model.n) // model.n
 
 
 def _starts(equations, aim):
@@ -338,7 +354,7 @@ def _starts(equations, aim):
     yield aim.reference
     if aim.guessed.any():
         yield gauss_newton(equations, aim.reference, replace(aim, movable=aim.movable & ~aim.guessed))
-    spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.sqrt(aim.weights)
+    spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.where(aim.guessed, np.sqrt(GUESSED), 1.0)
     rng = np.random.default_rng(SEED)
     for attempt in range(1, TRIES):
         yield aim.reference + attempt * FARTHER * rng.uniform(-1.0, 1.0, len(spread)) * spread
@@ -349,7 +365,7 @@ def _best(equations, aim):
     found = []
     for attempt, first in enumerate(_starts(equations, aim)):
         x = _nearest(equations, gauss_newton(equations, first, aim), aim)
-        residual, away = _largest(equations, x), np.linalg.norm((x - aim.reference)[aim.guessed])
+        residual, away = _largest(equations, x), np.linalg.norm((aim.sizes * (x - aim.reference))[aim.guessed])
         found.append((0 if residual < TOLERANCE else residual, away, attempt, x))
         if attempt >= aim.guessed.any() and min(found)[0] == 0:
             break
@@ -449,7 +465,7 @@ def _branches(equations, x, aim, model):
         same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
         if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
             found.append(y)
-    away = [np.linalg.norm((y - aim.reference)[aim.guessed]) for y in found]
+    away = [np.linalg.norm((aim.sizes * (y - aim.reference))[aim.guessed]) for y in found]
     return np.array([found[i] for i in np.argsort(np.round(away, 9), kind="stable")])
 
 
@@ -459,10 +475,10 @@ def _clear_choice(x, y, aim, model):
     Of the reference the lowest derivatives in which they differ count.
     """
     differ = np.abs(y - x) > DISTINCT * (1.0 + np.abs(x))
-    levels = np.maximum(0, np.arange(len(x)) - model.nq + model.n) // model.n
+    levels = _levels(model, len(x))
     guessed = differ & aim.guessed
     lowest = guessed if guessed.any() else differ & (levels == levels[differ].min())
-    between, way = (y - x)[lowest], (aim.reference - x)[lowest]
+    between, way = (aim.sizes * (y - x))[lowest], (aim.sizes * (aim.reference - x))[lowest]
     return bool(way @ between < NEARER * (between @ between))
 
 
