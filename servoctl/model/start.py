@@ -32,7 +32,7 @@ SEARCH_STEPS = 20  # of Newton's method from each
 NEARER = 0.25  # of the way from one such state to another: a reference before it is clearly nearer the first
 DISTINCT = 1e-3  # difference of two such states, relative to their size
 SHOWN = 3  # values by which a printed state tells branches apart
-STILL = 1e-6  # largest rate of a state at rest, relative to its size
+STILL = 1e-6  # largest rate of a value of a state at rest, relative to its size
 PRINTED_ZERO = 1e-14  # of the largest value: a smaller one that is not held is printed as zero
 
 
@@ -244,8 +244,9 @@ def _stays(model, t, x):
     if model.flat:
         return True
     f, n_x = model.function("ode").expression, len(model.state_names)
-    rates = (np.abs(f(at, x[:n_x], model.parameters).full()[:n_x]).max() for at in (t, np.nextafter(t, -np.inf)))
-    return any(not rate > STILL * (1.0 + np.abs(x).max()) for rate in rates)
+    slow, instants = STILL * (1.0 + np.abs(x[:n_x])), (t, np.nextafter(t, -np.inf))
+    rates = (np.abs(f(at, x[:n_x], model.parameters).full()[:n_x, 0]) for at in instants)
+    return any(not np.any(rate > slow) for rate in rates)
 
 
 def _split_held(model, held, hold):
