@@ -338,9 +338,8 @@ def _by_levels(equations, x, aim, model):
             movable = movable & ~some
             kept = gauss_newton(equations, np.where(some, aim.reference, x), replace(aim, movable=movable))
             if not _largest(equations, kept) < TOLERANCE:
-                open_ = movable | some
-                reference = np.where(open_, aim.reference, x)
-                kept = _nearest(equations, x, replace(aim, reference=reference, guessed=some, movable=open_))
+                reference, sizes = np.where(some, aim.reference, x), np.where(some, GUESSED, 1.0) * aim.sizes
+                kept = _nearest(equations, x, Aim(aim.names, reference, sizes, some, movable | some))
             x = kept if _largest(equations, kept) < TOLERANCE else x
     return x
 
@@ -427,10 +426,12 @@ def _nearest(equations, x, aim, iterations=40):
         with np.errstate(all="ignore"):
             trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
         trial = gauss_newton(equations, trial, aim, 12)
-        distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
-        if np.abs(equations.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
+        distance, before = (np.linalg.norm(aim.weights * (y - aim.reference)) for y in (trial, x))
+        if not (_largest(equations, trial) < TOLERANCE and distance <= before * (1 + TOLERANCE)):
             break
-        x = trial
+        x, change = trial, np.linalg.norm(aim.weights * (trial - x))
+        if change <= REPEATED * before:
+            break
     return x
 
 
