@@ -378,11 +378,11 @@ def _step(value, jacobian, aim):
     full = np.zeros(jacobian.shape[1])
     if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(value))):
         return full
-    rows = np.sqrt((jacobian**2).sum(axis=1))
+    a = jacobian[:, aim.movable] / aim.weights[aim.movable]
+    rows = np.sqrt((a**2).sum(axis=1))
     rows = np.where(rows > 0, rows, 1.0)
-    a = (jacobian / rows[:, None])[:, aim.movable] / aim.weights[aim.movable]
     if a.size:
-        full[aim.movable] = np.linalg.lstsq(a, value / rows, rcond=REPEATED)[0] / aim.weights[aim.movable]
+        full[aim.movable] = np.linalg.lstsq(a / rows[:, None], value / rows, rcond=REPEATED)[0] / aim.weights[aim.movable]
     return full
 
 
