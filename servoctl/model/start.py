@@ -331,16 +331,15 @@ def _by_blocks(model, t, equations, aim):
 
 
 def _by_levels(equations, x, aim, model):
-    """The state near x that is nearest to the reference in coordinates, then in each derivative; first in guesses."""
+    """The state near x that is nearest to guessed coordinates, then to each guessed derivative, then to the rest."""
     levels, movable = _levels(model, len(x)), aim.movable
-    for level in range(levels[-1] + 1):
-        for some in (movable & aim.guessed & (levels == level), movable & (levels == level)):
-            movable = movable & ~some
-            kept = gauss_newton(equations, np.where(some, aim.reference, x), replace(aim, movable=movable))
-            if not _largest(equations, kept) < TOLERANCE:
-                reference, sizes = np.where(some, aim.reference, x), np.where(some, GUESSED, 1.0) * aim.sizes
-                kept = _nearest(equations, x, Aim(aim.names, reference, sizes, some, movable | some))
-            x = kept if _largest(equations, kept) < TOLERANCE else x
+    for some in (*(aim.guessed & (levels == level) for level in range(levels[-1] + 1)), aim.movable & ~aim.guessed):
+        movable = movable & ~some
+        kept = gauss_newton(equations, np.where(some, aim.reference, x), replace(aim, movable=movable))
+        if not _largest(equations, kept) < TOLERANCE:
+            reference, sizes = np.where(some, aim.reference, x), np.where(some, GUESSED, 1.0) * aim.sizes
+            kept = _nearest(equations, x, Aim(aim.names, reference, sizes, some, movable | some))
+        x = kept if _largest(equations, kept) < TOLERANCE else x
     return x
 
 
