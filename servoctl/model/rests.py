@@ -39,8 +39,7 @@ class Rests:
         rows = ca.vertcat(still, *q.invariants.values(), *moving.values())
         self.names += (*q.invariants, *moving)
         self.function = ca.Function("rest", [q.t, z, p], [ca.densify(rows), ca.densify(ca.jacobian(rows, z))])
-        frame = [ca.densify(_still(q, e)) for e in (ca.SX(q.V), mechanism.mass, mechanism.E)]
-        self._frame = ca.Function("frame", [q.t, q.jet(0), p], frame)
+        self._frame = frame(mechanism)
 
     @classmethod
     def of_model(cls, model):
@@ -108,7 +107,7 @@ class Rests:
             if found and 0.5 in np.abs(turned):
                 break
             q = self._met(t, p, first + turned * np.pi, known, movable, angles)
-            sizes = self._sizes(t, p, q) if sizes is None else sizes
+            sizes = next(roots_of_inertia(self._frame, t, q, p)) if sizes is None else sizes
             weights = sizes * np.where(known, GUESSED, 1.0)
             z, rests, worst = self.reached(t, p, q, movable, weights, angles=angles)
             reason = reason or worst
@@ -151,14 +150,6 @@ class Rests:
                 break
         return q
 
-    def _sizes(self, t, p, q):
-        """The root of each coordinate's inertia, where it has one."""
-        V, M, _ = (np.array(part) for part in self._frame(t, q, p))
-        with np.errstate(all="ignore"):
-            sizes = np.sqrt(np.diag(np.linalg.pinv(V).T @ M @ np.linalg.pinv(V)))
-        heavy = np.isfinite(sizes) & (sizes > 0)
-        return np.where(heavy, sizes, sizes[heavy].min(initial=np.inf) if heavy.any() else 1.0)
-
     def _ordered(self, t, p, found, first, known, angles, sizes):
         """The rest to take, and others that are as near to the guess."""
         if not found:
@@ -181,6 +172,24 @@ class Rests:
             V = np.array(self._frame(t, z[: self.nq], p)[0])
             work += 0.5 * weight * (self.measured(t, z, p)[0][: self.n] @ np.linalg.pinv(V) @ way)
         return work
+
+
+def frame(mechanism):
+    """V, the inertia and the directions of the actuators at rest, a CasADi function of t, q and parameters."""
+    q, p = mechanism.q, ca.vertcat(*mechanism.parameters.symbols)
+    parts = [ca.densify(_still(q, e)) for e in (ca.SX(q.V), mechanism.mass, mechanism.E)]
+    return ca.Function("frame", [q.t, q.jet(0), p], parts)
+
+
+def roots_of_inertia(frame, t, q, p):
+    """The roots of the inertias of coordinates and of velocities at q (nq,), for want of inertia the least of them."""
+    V, M, _ = (np.array(part) for part in frame(t, q, p))
+    inverse = np.linalg.pinv(V) if np.isfinite(V).all() else np.nan * V.T
+    for inertia in (inverse.T @ M @ inverse, M):
+        with np.errstate(all="ignore"):
+            roots = np.sqrt(np.diag(inertia))
+        heavy = np.isfinite(roots) & (roots > 0)
+        yield np.where(heavy, roots, roots[heavy].min(initial=np.inf) if heavy.any() else 1.0)
 
 
 def _smallest(values):

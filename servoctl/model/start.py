@@ -11,7 +11,7 @@ from servoctl.checks import column, finite, mapping, named
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants
-from servoctl.model.rests import GUESSED, Rests
+from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
 from servoctl.spec.mechanism import require_known
 from servoctl.values import Value, frozen
 
@@ -30,7 +30,7 @@ SEARCH_STEPS = 20  # of Newton's method from each
 NEARER = 0.25  # of the way from one such state to another: a reference before it is clearly nearer the first
 DISTINCT = 1e-3  # difference of two such states, relative to their size
 SHOWN = 3  # values by which a printed state tells branches apart
-STILL = 1e-6  # largest rate of a state at rest, relative to its size
+STILL = 1e-6  # largest rate of a value of a state at rest, relative to its size
 PRINTED_ZERO = 1e-14  # of the largest value: a smaller one that is not held is printed as zero
 
 
@@ -168,24 +168,31 @@ def _numeric(f):
 
 @frozen(eq=False)
 class Aim:
-    """The state nearest to a reference is sought, by weights, with some values movable; arrays (n_x,)."""
+    """The state nearest to a reference is sought, by sizes and most of all in guessed values; arrays (n_x,)."""
 
     names: tuple
     reference: np.ndarray
-    weights: np.ndarray
+    sizes: np.ndarray
+    guessed: np.ndarray
     movable: np.ndarray
 
     @property
-    def guessed(self):
-        """Which values are guessed."""
-        return self.weights > 1.0
+    def weights(self):
+        """By which a distance of values from the reference counts."""
+        return np.where(self.guessed, GUESSED, 1.0) * self.sizes
 
     @classmethod
     def of(cls, names, guess, held, identity):
         """The state nearest to guessed values, with held ones; where neither says more, to zero or the identity's."""
         reference = np.array([held.get(name, guess.get(name, identity.get(name, 0.0))) for name in names])
-        weights = np.array([GUESSED if name in guess and name not in held else 1.0 for name in names])
-        return cls(names, reference, weights, np.array([name not in held for name in names]))
+        movable = np.array([name not in held for name in names])
+        return cls(names, reference, np.ones(len(names)), movable & np.isin(names, list(guess)), movable)
+
+    def weighed(self, model, t):
+        """Distances of coordinates and of velocities by the kinetic energy, and so those of higher derivatives."""
+        measured = model.once("frame", lambda: frame(model.reduction.mechanism))
+        of_q, of_w = roots_of_inertia(measured, t, self.reference[: model.nq], model.parameters)
+        return replace(self, sizes=np.append(of_q, np.resize(of_w, len(self.names) - model.nq)))
 
 
 @np.errstate(all="ignore")  # trial steps may leave the domain of the equations
@@ -197,7 +204,7 @@ def consistent(model, t, held, guess, hold):
     chosen = guess | values
     q, rows = model.reduction.mechanism.q, model.reduction.mechanism.followers | conditions
     equations = JetEquations(model, t, rows)
-    aim = Aim.of(equations.names, guess, values, q.identity)
+    aim = Aim.of(equations.names, guess, values, q.identity).weighed(model, t)
     for e in (list(places) for places, _ in q.spheres):
         if not aim.reference[e].any() and {*chosen} & {q.names[i] for i in e}:
             raise SpecificationError(
@@ -250,8 +257,9 @@ def _stays(model, t, x):
     if model.flat:
         return True
     f, n_x = model.function("ode").expression, len(model.state_names)
-    rates = (np.abs(f(at, x[:n_x], model.parameters).full()[:n_x]).max() for at in (t, np.nextafter(t, -np.inf)))
-    return any(not rate > STILL * (1.0 + np.abs(x).max()) for rate in rates)
+    slow, instants = STILL * (1.0 + np.abs(x[:n_x])), (t, np.nextafter(t, -np.inf))
+    rates = (np.abs(f(at, x[:n_x], model.parameters).full()[:n_x, 0]) for at in instants)
+    return any(not np.any(rate > slow) for rate in rates)
 
 
 def _split_held(model, held, hold):
@@ -318,9 +326,8 @@ def _solved(model, equations, aim, conditions, held):
     equations, x, residual = _solve(model, equations, aim, conditions)
     if not residual < TOLERANCE:
         _refuse(equations, aim, held, x)
-    free = free_names(equations, x, aim, {aim.names[i] for i in np.flatnonzero(aim.guessed)})
-    x = _at_guess(equations, x, aim, aim.guessed & np.isin(aim.names, free))
-    sought = aim.movable & ~np.isin(aim.names, free)
+    x = _by_levels(equations, x, aim, model)
+    sought = aim.movable & ~np.isin(aim.names, free_names(equations, x, aim, set(np.array(aim.names)[aim.guessed])))
     return equations, _branches(equations, x, replace(aim, movable=sought), model)
 
 
@@ -336,14 +343,22 @@ def _by_blocks(model, t, equations, aim):
     return x, _largest(equations, x)
 
 
-def _at_guess(equations, x, aim, guessed):
-    """A consistent state with all guessed values, else with those (n_z,) among them that are free, else x."""
-    for kept in (aim.guessed, guessed):
-        first = np.where(kept, aim.reference, x)
-        moved = gauss_newton(equations, first, replace(aim, movable=aim.movable & ~kept)) if kept.any() else x
-        if _largest(equations, moved) < TOLERANCE:
-            return moved
+def _by_levels(equations, x, aim, model):
+    """The state near x that is nearest to guessed coordinates, then to each guessed derivative, then to the rest."""
+    levels, movable = _levels(model, len(x)), aim.movable
+    for some in (*(aim.guessed & (levels == level) for level in range(levels[-1] + 1)), aim.movable & ~aim.guessed):
+        movable = movable & ~some
+        kept = gauss_newton(equations, np.where(some, aim.reference, x), replace(aim, movable=movable))
+        if not _largest(equations, kept) < TOLERANCE:
+            reference, sizes = np.where(some, aim.reference, x), np.where(some, GUESSED, 1.0) * aim.sizes
+            kept = _nearest(equations, x, Aim(aim.names, reference, sizes, some, movable | some))
+        x = kept if _largest(equations, kept) < TOLERANCE else x
     return x
+
+
+def _levels(model, size):
+    """The derivative that each of the first jets is."""
+    return np.maximum(0, np.arange(size) - model.nq + model.n) // model.n
 
 
 def _starts(equations, aim):
@@ -351,7 +366,7 @@ def _starts(equations, aim):
     yield aim.reference
     if aim.guessed.any():
         yield gauss_newton(equations, aim.reference, replace(aim, movable=aim.movable & ~aim.guessed))
-    spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.sqrt(aim.weights)
+    spread = (1.0 + np.abs(aim.reference)) * aim.movable / np.where(aim.guessed, np.sqrt(GUESSED), 1.0)
     rng = np.random.default_rng(SEED)
     for attempt in range(1, TRIES):
         yield aim.reference + attempt * FARTHER * rng.uniform(-1.0, 1.0, len(spread)) * spread
@@ -362,7 +377,7 @@ def _best(equations, aim):
     found = []
     for attempt, first in enumerate(_starts(equations, aim)):
         x = _nearest(equations, gauss_newton(equations, first, aim), aim)
-        residual, away = _largest(equations, x), np.linalg.norm((x - aim.reference)[aim.guessed])
+        residual, away = _largest(equations, x), np.linalg.norm((aim.sizes * (x - aim.reference))[aim.guessed])
         found.append((0 if residual < TOLERANCE else residual, away, attempt, x))
         if attempt >= aim.guessed.any() and min(found)[0] == 0:
             break
@@ -375,11 +390,11 @@ def _step(value, jacobian, aim):
     full = np.zeros(jacobian.shape[1])
     if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(value))):
         return full
-    rows = np.sqrt((jacobian**2).sum(axis=1))
+    a = jacobian[:, aim.movable] / aim.weights[aim.movable]
+    rows = np.sqrt((a**2).sum(axis=1))
     rows = np.where(rows > 0, rows, 1.0)
-    a = (jacobian / rows[:, None])[:, aim.movable] / aim.weights[aim.movable]
     if a.size:
-        full[aim.movable] = np.linalg.lstsq(a, value / rows, rcond=REPEATED)[0] / aim.weights[aim.movable]
+        full[aim.movable] = np.linalg.lstsq(a / rows[:, None], value / rows, rcond=REPEATED)[0] / aim.weights[aim.movable]
     return full
 
 
@@ -423,10 +438,12 @@ def _nearest(equations, x, aim, iterations=40):
         with np.errstate(all="ignore"):
             trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
         trial = gauss_newton(equations, trial, aim, 12)
-        distance, before = (np.sum((aim.weights * (y - aim.reference)) ** 2) for y in (trial, x))
-        if np.abs(equations.scaled(trial)).max(initial=0.0) > TOLERANCE or not distance < before * (1 - 1e-12):
+        distance, before = (np.linalg.norm(aim.weights * (y - aim.reference)) for y in (trial, x))
+        if not (_largest(equations, trial) < TOLERANCE and distance <= before * (1 + TOLERANCE)):
             break
-        x = trial
+        x, change = trial, np.linalg.norm(aim.weights * (trial - x))
+        if change <= REPEATED * before:
+            break
     return x
 
 
@@ -462,7 +479,7 @@ def _branches(equations, x, aim, model):
         same = residual < TOLERANCE and any(_same_motion(y, z, model) for z in found)
         if residual < TOLERANCE and not same and not _clear_choice(x, y, aim, model):
             found.append(y)
-    away = [np.linalg.norm((y - aim.reference)[aim.guessed]) for y in found]
+    away = [np.linalg.norm((aim.sizes * (y - aim.reference))[aim.guessed]) for y in found]
     return np.array([found[i] for i in np.argsort(np.round(away, 9), kind="stable")])
 
 
@@ -472,10 +489,10 @@ def _clear_choice(x, y, aim, model):
     Of the reference the lowest derivatives in which they differ count.
     """
     differ = np.abs(y - x) > DISTINCT * (1.0 + np.abs(x))
-    levels = np.maximum(0, np.arange(len(x)) - model.nq + model.n) // model.n
+    levels = _levels(model, len(x))
     guessed = differ & aim.guessed
     lowest = guessed if guessed.any() else differ & (levels == levels[differ].min())
-    between, way = (y - x)[lowest], (aim.reference - x)[lowest]
+    between, way = (aim.sizes * (y - x))[lowest], (aim.sizes * (aim.reference - x))[lowest]
     return bool(way @ between < NEARER * (between @ between))
 
 

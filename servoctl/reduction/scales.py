@@ -70,7 +70,7 @@ def usual(mechanism, program, guess, values, window):
     if terms.f.has_free():
         return Scales(np.ones(mechanism.q.nq), np.ones(mechanism.q.n))
     wishes, weights = terms.wishes(guess)
-    logs = np.zeros(terms.unknowns.shape[1])
+    logs = np.linalg.lstsq(weights, wishes, rcond=None)[0]
     for _ in range(ROUNDS):
         scales = terms.scales(logs)
         step = _balanced(terms.contributions(scales, window(scales.time)), terms.unknowns, logs, wishes, weights)

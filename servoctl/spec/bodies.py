@@ -110,8 +110,8 @@ def lagrange(q, kinetic):
         momentum = ca.gradient(kinetic, w)
         slope = ca.gradient(kinetic, ca.vertcat(*q))
     else:
-        d, lt, p = ca.ldl(q.V.T @ q.V)
-        left = ca.ldl_solve(q.V.T @ (v - q.h), d, lt, p)
+        square = q.n == q.nq  # normal equations have the square of its condition, as in metres and millimetres
+        left = ca.solve(q.V, v - q.h) if square else ca.ldl_solve(q.V.T @ (v - q.h), *ca.ldl(q.V.T @ q.V))
         continued = ca.substitute(kinetic, w, left)
         back = q.V @ w + q.h
         momentum = ca.substitute(ca.gradient(continued, v), v, back)

@@ -164,6 +164,9 @@ class Reference:
             force = ca.SX.sym("u", m)
             reaction, unknown = self.E @ force, [force, nu]
         self.multipliers = ca.vertcat(*unknown)
+        self.multiplier_sizes = np.ones(self.multipliers.numel())
+        if redundant:
+            self.multiplier_sizes[m + km : m + km + n] = case.sizes[1]
         self.count = force.numel()
         total = self.balance - reaction - self.Gm.T @ nu
         nearly = "nearly dependent" in case.kinds  # the array is as badly conditioned as such rows, their equivalent is not
@@ -219,7 +222,7 @@ class Reference:
     def solve(self, t, q0, w0, more=0, near=False, unit=1.0):
         """The array at an instant from a state of the motion: q0 (n,), w0 (n, coefficients), without accelerations.
 
-        Its columns are scaled to a unit of time [s].
+        Its columns are scaled to a unit of time [s] and to the coordinates in which the case was drawn.
 
         A state that is `near` a consistent one is held until the higher coefficients fit it, and moved then.
         """
@@ -231,9 +234,12 @@ class Reference:
         state = np.zeros(len(x), dtype=bool)
         q_state, w_state, _ = self._parts(state, N)
         q_state[:, 0], w_state[:, : min(known, self.top - 1)] = True, True
-        sizes, everything = np.ones(len(x)), np.ones(len(x), dtype=bool)
-        for part in self._parts(sizes, N):
+        natural, times, everything = np.ones(len(x)), np.ones(len(x)), np.ones(len(x), dtype=bool)
+        for part, size in zip(self._parts(natural, N), (*self.case.sizes, self.multiplier_sizes), strict=True):
+            part[:] = size[:, None]
+        for part in self._parts(times, N):
             part[:] = unit ** -np.arange(part.shape[1])
+        sizes = natural * times
         if not self._newton(t, x, N, ~state if near else everything, sizes):
             return None
         if near:
@@ -242,12 +248,12 @@ class Reference:
             held = x.copy()
             if off > HELD * (1 + np.abs(x / sizes).max()) and not self._newton(t, x, N, everything, sizes):
                 return None
-            if np.abs(x - held)[state].max() > MOVED * (1 + np.abs(held[state]).max()):
+            if np.abs((x - held) / natural)[state].max() > MOVED * (1 + np.abs((held / natural)[state]).max()):
                 x[:] = held  # Newton's method has left for another motion, next to a singular one
         residual, J = self.array(t, q, w, multipliers)
         J *= sizes
         scale = self._row_scales(J)
-        clear, gain, loose = self._determined(J[:, ~state] * scale[:, None], state, N, sizes)
+        clear, gain, loose = self._determined(J[:, ~state] * scale[:, None], state, N, times)
         reaction = np.array(self._force(t, q, w, multipliers))
         return Solution(q[:, 0], w.copy(), reaction, clear, gain, float(np.abs(residual * scale).max()), loose)
 
@@ -283,17 +289,17 @@ class Reference:
         """The step of least norm; a complete orthogonal factorisation, several times faster than an SVD."""
         return lstsq(J, r, cond=CUTOFF, lapack_driver="gelsy", check_finite=False)[0]
 
-    def _determined(self, J, state, N, sizes):
+    def _determined(self, J, state, N, times):
         key = np.zeros(len(state), dtype=bool)
         _, w, multipliers = self._parts(key, N)
         w[:, self.top - 1] = True
         multipliers[: self.count, 0] = True
-        key, sizes = key[~state], sizes[~state]
+        key, times = key[~state], times[~state]
         _, s, v = np.linalg.svd(J, full_matrices=True)
         s = np.append(s, np.zeros(len(v) - len(s)))
         live = s > CUTOFF * s[0]
         loose = float(np.linalg.norm(v[~live][:, key])) if not live.all() else 0.0
-        gain = float(np.linalg.norm(v[live][:, key] * sizes[key] / s[live, None]))
+        gain = float(np.linalg.norm(v[live][:, key] * times[key] / s[live, None]))
         return loose < 1e-6, gain, loose
 
     def _force(self, t, q, w, multipliers):
@@ -325,6 +331,8 @@ class Reference:
         for level in range(min(w.shape[1], LEVELS)):
             jets[1 + self.n * (level + 1) : 1 + self.n * (level + 2)] = w[:, level] * factorial(level)
         M, E, G, Gm = (np.array(a).reshape(a.shape) for a in self.matrices(jets))
+        size = self.case.sizes[1]
+        M, E, G, Gm = size[:, None] * M * size, size[:, None] * E, G * size, Gm * size
         unit = lambda a: a / np.maximum(np.linalg.norm(a, axis=1), 1e-300)[:, None]  # noqa: E731
         smallest = lambda a: np.linalg.svd(a, compute_uv=False).min(initial=np.inf)  # noqa: E731
         both = np.hstack([E, Gm.T]) if E.size or Gm.size else np.zeros((self.n, 0))

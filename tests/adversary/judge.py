@@ -27,10 +27,14 @@ MOST_CALLS = 100_000_000  # of functions, for a case; half a million are usual
 
 @dataclass(frozen=True)
 class Verdict:
-    """`outcome` is "right", "refused rightly", or "wrong: ..." with what is wrong; `detail` holds the numbers."""
+    """`outcome` is "right", "refused rightly", or "wrong: ..." with what is wrong; `detail` holds the numbers.
+
+    Of a plan `gain` is the largest sensitivity of accelerations and actuation.
+    """
 
     outcome: str
     detail: str = ""
+    gain: float = 0.0
 
     @property
     def wrong(self):
@@ -74,40 +78,88 @@ def specification(case):
     return mechanism, sv.Program({f"row{i}": read(text) for i, text in enumerate(case.rows)}, by=case.by)
 
 
-def judge(case):
-    """Run a case through the package and the reference."""
+@dataclass
+class Attempt:
+    """What the package made of a case, and the error that ended it."""
+
+    stage: str = "specification"
+    model: object = None
+    start: object = None
+    run: object = None
+    proof: object = None
+    error: object = None
+
+
+def judge(case, drawn=None):
+    """Run a case through the package and the reference; it ends as it does in the coordinates in which it was drawn."""
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"), at_most(MOST_CALLS):
             warnings.simplefilter("ignore")
-            return _judge(case)
+            attempt = _attempt(case)
+            verdict = _judged(case, attempt)
+            return verdict if verdict.wrong or drawn is None else _alike(case, attempt, drawn, verdict)
     except TooMuchWork:
         return Verdict(f"wrong: more than {MOST_CALLS} calls")
 
 
-def _judge(case):
-    reference, stage, model, run = Reference(case), "specification", None, None
-    speed = "w" if case.V else "dq"
+def _attempt(case, verified=True):
+    a, speed = Attempt(), "w" if case.V else "dq"
     guess = {f"q{i}": value for i, value in enumerate(case.guess)}
     guess |= {f"{speed}{i}": value for i, value in enumerate(case.speeds)}
-    start = None
     try:
         mechanism, program = specification(case)
-        stage = "derive"
-        model = sv.derive(mechanism, program, guess=guess)
-        stage = "start"
-        start = model.start(guess=guess)
-        stage = "simulate"
-        method = None if model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
-        run = sv.simulate(model, start, (0.0, SPAN), method, t_eval=np.linspace(0.0, SPAN, SAMPLES))
-        stage = "verify"
-        proof = sv.verify(model, run, segments=1)
-    except sv.ServoError as error:
-        return _refused(reference, case, stage, error, start, model)
-    except TooMuchWork:
-        return Verdict(f"wrong: more than {MOST_CALLS} calls in {stage}")
-    except Exception as error:  # noqa: BLE001
-        return Verdict(f"wrong: {type(error).__name__} in {stage}", str(error))
-    return _compared(reference, case, model, run, proof)
+        a.stage = "derive"
+        a.model = sv.derive(mechanism, program, guess=guess)
+        a.stage = "start"
+        a.start = a.model.start(guess=guess)
+        a.stage = "simulate"
+        method = None if a.model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
+        a.run = sv.simulate(a.model, a.start, (0.0, SPAN), method, t_eval=np.linspace(0.0, SPAN, SAMPLES))
+        if verified:
+            a.stage = "verify"
+            a.proof = sv.verify(a.model, a.run, segments=1)
+    except (Exception, TooMuchWork) as error:  # noqa: BLE001
+        a.error = error
+    return a
+
+
+def _judged(case, a):
+    if isinstance(a.error, sv.ServoError):
+        return _refused(Reference(case), case, a.stage, a.error, a.start, a.model)
+    if isinstance(a.error, TooMuchWork):
+        return Verdict(f"wrong: more than {MOST_CALLS} calls in {a.stage}")
+    if a.error is not None:
+        return Verdict(f"wrong: {type(a.error).__name__} in {a.stage}", str(a.error))
+    return _compared(Reference(case), case, a.model, a.run, a.proof)
+
+
+def _alike(case, here, drawn, verdict):
+    """The verdict on a case, wrong where it ends otherwise than in the coordinates in which it was drawn."""
+    there, tolerance = _attempt(drawn, verified=False), AGREE * max(1.0, verdict.gain / SHARP)
+    ends = [type(a.error).__name__ if a.error else "a plan" for a in (there, here)]
+    if ends[0] != ends[1]:
+        errors = " | ".join(f"{a.stage}: {a.error}" for a in (there, here))
+        return Verdict(f"wrong: moved, {ends[1]} instead of {ends[0]}", errors)
+    if here.error:
+        return verdict
+    if here.model.flat != there.model.flat:
+        return Verdict(f"wrong: moved, flat {here.model.flat} instead of {there.model.flat}", verdict.detail)
+    apart = {"start": _apart(case.as_drawn(here.start.values), there.start.values)}
+    apart["motion"] = _apart(case.as_drawn(here.run.jets[:, INSTANTS]), there.run.jets[:, INSTANTS])
+    apart["actuation"] = _apart(*(_force(c, a.run)[:, INSTANTS] for c, a in ((case, here), (drawn, there))))
+    numbers = ", ".join(f"{what} {gap:.1e}" for what, gap in apart.items()) + "; " + verdict.detail
+    other = next((what for what, gap in apart.items() if not gap <= tolerance), None)
+    return Verdict(f"wrong: moved, another {other}", numbers) if other else Verdict(verdict.outcome, numbers)
+
+
+def _apart(here, there):
+    """The largest difference relative to 1 plus the size of what is there."""
+    return np.abs(here - there).max(initial=0.0) / (1 + np.abs(there).max(initial=0.0))
+
+
+def _force(case, run):
+    """Actuation, or the whole reaction of an ideal program as drawn, at samples."""
+    return case.forces_as_drawn(run.signals("balance" if case.by == "ideal" else "actuation")[1])
 
 
 def _coefficients(jets, n):
@@ -122,25 +174,26 @@ def _at(reference, run, k):
 
 
 def _compared(reference, case, model, run, proof):
-    n, top = case.n, reference.top
-    force = run.signals("actuation")[1] if case.by != "ideal" else run.signals("balance")[1]
+    n, top, force, (q_size, w_size) = case.n, reference.top, _force(case, run), case.sizes
     worst = {"acceleration": 0.0, "actuation": 0.0, "state": 0.0}
-    unclear, gains = "", []
+    unclear, gains, large = "", [], np.abs(case.as_drawn(run.jets)).max(axis=0) > LARGE
     for k in INSTANTS:
-        q, w = _coefficients(run.jets[:, k], n)
         solution = _at(reference, run, k)
+        if large[k] and (solution is None or not solution.clear):  # beside a pole: the last sample before
+            k = max(0, np.argmax(large) - 1)
+            solution = _at(reference, run, k)
+        q, w = _coefficients(run.jets[:, k], n)
         if solution is None or not solution.clear or solution.residual > AGREE:
             numbers = "none" if solution is None else f"loose {solution.loose:.1e}, residual {solution.residual:.1e}"
             unclear = f"at t = {run.t[k]:.2f}: {numbers}"
             continue
         gains.append(solution.gain)
         level = min(top, w.shape[1])
-        here, there = w[:, :level], solution.w[:, :level]
+        here, there = (each[:, :level] / w_size[:, None] for each in (w, solution.w))
         size = 1 + np.abs(there).max()
-        worst["state"] = max(worst["state"], np.abs(solution.q - q).max() / size)
+        worst["state"] = max(worst["state"], np.abs((solution.q - q) / q_size).max() / size)
         worst["acceleration"] = max(worst["acceleration"], np.abs(here - there).max() / size)
-        gap = np.abs(force[:, k] - solution.force).max(initial=0.0) / (1 + np.abs(solution.force).max(initial=0.0))
-        worst["actuation"] = max(worst["actuation"], gap)
+        worst["actuation"] = max(worst["actuation"], _apart(force[:, k], case.forces_as_drawn(solution.force)))
     numbers = ", ".join(f"{name} {value:.1e}" for name, value in worst.items())
     numbers += f"; gain {max(gains, default=np.inf):.1e}; {unclear} {proof!r}"
     if unclear:
@@ -150,7 +203,7 @@ def _compared(reference, case, model, run, proof):
         return Verdict(f"wrong: another motion or force, {what}", numbers)
     if not proof.passed:
         return Verdict("wrong: verify fails a right plan (" + ", ".join(map(_kind, proof.failures)) + ")", numbers)
-    return Verdict("right", numbers)
+    return Verdict("right", numbers, max(gains))
 
 
 def _kind(failure):
@@ -198,8 +251,10 @@ def _beside(reference, start, model):
 
     Towards it lead later starts, and states of the same instant.
     """
+    q_size, w_size = reference.case.sizes
+    sizes = np.append(q_size, np.resize(w_size, len(start.names) - reference.n))
     rng = np.random.default_rng(1)
-    directions = dict(zip(start.names, rng.uniform(-1, 1, len(start.names)), strict=True))
+    directions = dict(zip(start.names, rng.uniform(-1, 1, len(start.names)) * sizes, strict=True))
     for later in (True, False):
         last = np.inf
         for distance in BESIDE[-2:] if later else BESIDE:
@@ -224,12 +279,13 @@ def _cause(reference, case, start, error, model):
         (q, w), near = _coefficients(start.values, case.n), True
     if run is not None and len(run.t) and np.all(np.isfinite(run.jets[:, -1])):
         t, (q, w) = run.t[-1], _coefficients(run.jets[: -case.n, -1], case.n)
-        if np.abs(run.jets[:, -1]).max() > LARGE:
-            return f"the motion has grown to {np.abs(run.jets[:, -1]).max():.1e}"
+        largest = np.abs(case.as_drawn(run.jets[:, -1])).max()
+        if largest > LARGE:
+            return f"the motion has grown to {largest:.1e}"
     points = [reference.determined(t, q, w[:, : reference.top - 1], near)]
     for seed in range(1, 4 if start is None else 1):  # ranks may fall at one point by accident
         rng = np.random.default_rng(seed)
-        points.append(reference.determined(0.1 * seed, q + rng.normal(0, 0.3, case.n), w[:, :1]))
+        points.append(reference.determined(0.1 * seed, q + rng.normal(0, 0.3, case.n) * case.sizes[0], w[:, :1]))
     points = [p for p in points if p is not None]
     solved = [p for p in points if p.residual < 1e-9]
     last = -1

@@ -5,12 +5,19 @@ A case is drawn through `pick(low, high)`, a source of whole numbers: a seeded g
 
 Formulas name t, q0, q1, ... (coordinates), w0, w1, ... (quasi-velocities), w0_1, w0_2, ... (their derivatives), and
 D(f), the total derivative.
+
+The same case in other coordinates (`moved`) has other origins, zeros of angles, units, signs and names.
 """
 
 import json
+import re
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
+
+
+ZEROS = (0.0, 1.0, -1.0, 10.0, -10.0, 100.0, -100.0, 0.3, np.pi / 2, np.pi, 6.0)
+SCALES = (1.0, -1.0, 1e3, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,37 @@ class Case:
     guess: tuple = ()  # of the coordinates at the start
     speeds: tuple = ()
     kinds: tuple = field(default=(), compare=False)  # words for the table of counts
+    moves: tuple = ()  # (zero, scale, place): a coordinate as drawn is scale * q_place + zero; empty: as drawn
+
+    @property
+    def scales(self):
+        """Changes of the coordinates and of the quasi-velocities as drawn with those of the case, (2, n)."""
+        scales = np.ones((2, self.n))
+        for _, scale, place in self.moves:
+            scales[: 1 if self.V else 2, place] = scale
+        return scales
+
+    @property
+    def sizes(self):
+        """What is of order one in coordinates as drawn, of coordinates and quasi-velocities, (2, n)."""
+        return 1 / np.abs(self.scales)
+
+    def as_drawn(self, jets):
+        """Jets q, w, w', ... (n k, ...) of the case in the coordinates in which it was drawn."""
+        blocks = np.array(jets).reshape(-1, self.n, *np.shape(jets)[1:])
+        zeros, scales = np.zeros_like(blocks[0]), self.scales.reshape(2, self.n, *[1] * (blocks.ndim - 2))
+        order = [place for _, _, place in self.moves] or range(self.n)
+        for zero, _, place in self.moves:
+            zeros[place] = zero
+        blocks = np.concatenate([blocks[:1] * scales[0] + zeros, blocks[1:] * scales[1]])
+        return blocks[:, order].reshape(np.shape(jets))
+
+    def forces_as_drawn(self, forces):
+        """Actuation as it is, the whole reaction (n, ...) of an ideal program by the velocities as drawn."""
+        if self.by != "ideal":
+            return forces
+        order = [place for _, _, place in self.moves] or range(self.n)
+        return (forces.T / self.scales[1]).T[order]
 
     def as_text(self):
         return json.dumps(asdict(self), indent=1)
@@ -48,10 +86,60 @@ def from_text(text):
     return Case(**{key: tuples(value) for key, value in json.loads(text).items()})
 
 
-def seeded(seed):
-    """The case of a seed."""
+def seeded(seed, other=False):
+    """The case of a seed, or it in other coordinates."""
     rng = np.random.default_rng(seed)
-    return draw(lambda low, high: int(rng.integers(low, high + 1)))
+    pick = lambda low, high: int(rng.integers(low, high + 1))  # noqa: E731
+    case = draw(pick)
+    return moved(case, _moves(pick, case.n)) if other else case
+
+
+def _moves(pick, n):
+    """Zeros, scales and places of n coordinates."""
+    left = list(range(n))
+    return tuple((ZEROS[pick(0, 10)], SCALES[pick(0, 3)], left.pop(pick(0, len(left) - 1))) for _ in range(n))
+
+
+def moved(case, moves):
+    """A case in coordinates of which those of the case are scale * q_place + zero.
+
+    Its velocities are those of its coordinates, but for quasi-velocities, which only change their names. Generalised
+    forces and directions are by velocities, displacements remain what they are.
+    """
+    rates = [1.0 if case.V else scale for _, scale, _ in moves]
+
+    def name(match):
+        letter, i, level = match[1], int(match[2]), match[3] or ""
+        zero, scale, place = moves[i]
+        new, scale = f"{letter}{place}{level}", scale if letter == "q" else rates[i]
+        new = new if scale == 1 else f"({scale!r}*{new})"
+        return f"({new} + {zero!r})" if letter == "q" and zero else new
+
+    def there(texts):
+        return re.sub(r"\b([qw])(\d+)(_\d+)?\b", name, texts) if isinstance(texts, str) else tuple(map(there, texts))
+
+    def placed(values):
+        return tuple(value for _, value in sorted(zip((place for *_, place in moves), values, strict=False)))
+
+    def times(factors, texts):
+        return placed([f"{f!r}*({text})" if f != 1 else text for f, text in zip(factors, there(texts), strict=False)])
+
+    slower = [1 / scale for _, scale, _ in moves]
+    return replace(
+        case,
+        positions=there(case.positions),
+        potential=there(case.potential),
+        forces=times(rates, case.forces),
+        V=placed([times([f] * case.n, row) for f, row in zip(slower, case.V, strict=False)]),
+        h=times(slower, case.h),
+        material=there(case.material),
+        actuators=tuple(times(rates, a) if isinstance(a, tuple) else there(a) for a in case.actuators),
+        rows=there(case.rows),
+        plain=there(case.plain),
+        guess=placed([(value - zero) / scale for value, (zero, scale, _) in zip(case.guess, moves, strict=True)]),
+        speeds=placed([value / rate for value, rate in zip(case.speeds, rates, strict=True)]),
+        moves=moves,
+    )
 
 
 def cases(known=True):

@@ -11,6 +11,7 @@ import os
 import sys
 import time
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("SERVOCTL_COMPILER", "none")  # a case is evaluated too few times to be worth compiling
@@ -22,15 +23,17 @@ from judge import judge  # noqa: E402
 from machines import from_text, seeded  # noqa: E402
 
 
-def _one(seed):
-    start, case = time.process_time(), seeded(seed)
-    return seed, case, judge(case), time.process_time() - start
+def _one(seed, moved=False):
+    start, drawn = time.process_time(), seeded(seed)
+    case = seeded(seed, other=True) if moved else drawn
+    return seed, case, judge(case, drawn if moved else None), time.process_time() - start
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0, help="of the first case; the others follow")
+    parser.add_argument("--moved", action="store_true", help="in other coordinates, compared with those of the seed")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("findings"), help="folder of findings")
     parser.add_argument("--log", type=Path, help="a line for each case; cases that it holds are not run again")
@@ -42,7 +45,7 @@ def main():
         return 0
     done = _logged(options.log)
     seeds = [seed for seed in range(options.seed, options.seed + options.cases) if seed not in done]
-    for seed, case, verdict, seconds in _verdicts(seeds, options.jobs):
+    for seed, case, verdict, seconds in _verdicts(seeds, options.jobs, options.moved):
         line = {"seed": seed, "outcome": verdict.outcome, "kinds": sorted(set(case.kinds)), "seconds": round(seconds, 2)}
         done[seed] = line
         if options.log:
@@ -62,16 +65,17 @@ def _logged(log):
     return {line["seed"]: line for line in map(json.loads, lines)}
 
 
-def _verdicts(seeds, jobs):
+def _verdicts(seeds, jobs, moved):
     from tqdm import tqdm
 
+    one = partial(_one, moved=moved)
     if jobs == 1:
-        yield from map(_one, tqdm(seeds, unit="case"))
+        yield from map(one, tqdm(seeds, unit="case"))
         return
     from concurrent.futures import ProcessPoolExecutor
 
     with ProcessPoolExecutor(jobs) as pool:
-        yield from tqdm(pool.map(_one, seeds, chunksize=4), total=len(seeds), unit="case")
+        yield from tqdm(pool.map(one, seeds, chunksize=4), total=len(seeds), unit="case")
 
 
 def table(lines):

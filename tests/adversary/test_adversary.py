@@ -1,11 +1,13 @@
 """Random mechanisms and programs end in a plan that the reference confirms, or in a refusal that it confirms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from derivative_array import Reference
 from hypothesis import HealthCheck, given, settings
 from judge import judge
-from machines import Case, cases, from_text, seeded
+from machines import Case, cases, from_text, moved, seeded
 
 from servoctl.codegen import compiler
 
@@ -52,8 +54,39 @@ def test_cases_that_ended_wrongly(outcome, seed):
 
 def test_cases_survive_their_text():
     for seed in range(20):
-        case = seeded(seed)
-        assert from_text(case.as_text()) == case
+        for other in (False, True):
+            case = seeded(seed, other)
+            assert from_text(case.as_text()) == case
+
+
+MOVED = {  # seeds of cases that once ended otherwise in other coordinates, or their starts did
+    "nearest to a guess by units": (5000001, 5000017, 5000085, 5000126),
+    "what gives way by the order of names": (5000007, 5000016, 5000045),
+    "higher derivatives nearest to zero by units": (5000006, 5000059),
+    "a frame in metres and millimetres": (5000019,),
+    "rates beside a coordinate of another origin": (5000034,),
+    "an exponential of a coordinate in another unit": (5100050,),
+}
+
+
+@pytest.mark.parametrize("seed", [seed for seeds in MOVED.values() for seed in seeds])
+def test_cases_end_alike_in_other_coordinates(seed):
+    verdict = judge(seeded(seed, other=True), seeded(seed))
+    assert verdict.outcome == "right", verdict.detail
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_reference_solves_the_same_case_in_other_coordinates(seed):
+    drawn, moves = seeded(seed), seeded(seed, other=True).moves
+    start = Reference(drawn).determined(0.0, np.array(drawn.guess), np.array(drawn.speeds)[:, None])
+    drawn = replace(drawn, guess=tuple(start.q), speeds=tuple(start.w[:, 0]))
+    motions, forces = [], []
+    for case in (drawn, moved(drawn, moves)):
+        solution = Reference(case).determined(0.0, np.array(case.guess), np.array(case.speeds)[:, None], near=True)
+        motions.append(case.as_drawn(np.concatenate([solution.q, *solution.w[:, :2].T])))
+        forces.append(case.forces_as_drawn(solution.force))
+    assert motions[1] == pytest.approx(motions[0], abs=1e-10)
+    assert forces[1] == pytest.approx(forces[0], abs=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(4))
