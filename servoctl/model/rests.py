@@ -142,8 +142,9 @@ class Rests:
         """q on the constraints and the program, moved by the actuators, by what nobody guessed, at last by anything."""
         V, _, E = (np.array(part) for part in self._frame(t, q, p))
         driven, first = np.abs(V @ E).max(axis=1, initial=0.0) > 0, q
+        sizes = next(roots_of_inertia(self._frame, t, q, p))
         for some in (movable & driven, movable & ~known, movable):
-            z, there, _ = self.reached(t, p, q if some is movable else first, some, some=slice(self.n, None))
+            z, there, _ = self.reached(t, p, q if some is movable else first, some, sizes, slice(self.n, None))
             q = z[: self.nq]
             if there:
                 break
