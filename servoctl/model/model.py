@@ -713,9 +713,9 @@ class Model(Detailed):
             Time of the start [s].
         guess : dict of str to float, optional
             Approximate values. Where a path begins at rest, the start is the state of rest nearest to them. Elsewhere
-            free values start there if that is consistent; values without a guess are as near to zero as the invariants
-            allow. A coordinate that the model leaves out, and that is named here or held, is a part of the state, and
-            of the motions that begin there.
+            they are kept if that is consistent, else the state is nearest to them by the kinetic energy, coordinates
+            first; values without a guess are as near to zero as the invariants then allow. A coordinate that the model
+            leaves out, and that is named here or held, is a part of the state, and of the motions that begin there.
         hold : dict of str to SX, optional
             Further conditions by name: expressions of t, the coordinates and their derivatives of any order that are
             zero at the start, such as `{"heading": ca.atan2(dy, dx) - 0.5}`.

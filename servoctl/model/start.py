@@ -390,11 +390,12 @@ def _step(value, jacobian, aim):
     full = np.zeros(jacobian.shape[1])
     if not (np.all(np.isfinite(jacobian)) and np.all(np.isfinite(value))):
         return full
-    a = jacobian[:, aim.movable] / aim.weights[aim.movable]
+    weights = aim.weights[aim.movable]
+    a = jacobian[:, aim.movable] / weights
     rows = np.sqrt((a**2).sum(axis=1))
     rows = np.where(rows > 0, rows, 1.0)
     if a.size:
-        full[aim.movable] = np.linalg.lstsq(a / rows[:, None], value / rows, rcond=REPEATED)[0] / aim.weights[aim.movable]
+        full[aim.movable] = np.linalg.lstsq(a / rows[:, None], value / rows, rcond=REPEATED)[0] / weights
     return full
 
 

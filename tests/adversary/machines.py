@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-
 ZEROS = (0.0, 1.0, -1.0, 10.0, -10.0, 100.0, -100.0, 0.3, np.pi / 2, np.pi, 6.0)
 SCALES = (1.0, -1.0, 1e3, 1e-3)
 
