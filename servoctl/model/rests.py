@@ -82,14 +82,20 @@ class Rests:
         return best, least <= MET, (self.names[np.arange(len(self.names))[some][worst]], float(rows[worst]))
 
     def _step(self, rows, slopes, movable, weights, angles):
-        """The least weighted step of the coordinates that the rows ask for, whatever the forces, and these forces."""
+        """The least weighted step of the coordinates that the rows ask for, whatever the forces, and these forces.
+
+        Weights choose among steps, and decide no rank.
+        """
         sizes = np.maximum(np.abs(slopes).max(axis=1), TINY)[:, None]
         of_q, of_mu = np.split(slopes / sizes, [self.nq], axis=1)
         left, singular, _ = np.linalg.svd(of_mu)
         unforced = left[:, np.sum(singular > RANK * singular.max(initial=0.0)) :].T
         step, right = np.zeros(slopes.shape[1]), -rows / sizes[:, 0]
-        columns = (unforced @ of_q)[:, movable] / weights[movable]
-        step[: self.nq][movable] = np.linalg.lstsq(columns, unforced @ right, rcond=RANK)[0] / weights[movable]
+        columns, weights = (unforced @ of_q)[:, movable], weights[movable]
+        largest = np.maximum(np.abs(columns).max(axis=0, initial=0.0), TINY)
+        rank = np.linalg.matrix_rank(columns / largest, rtol=RANK) if columns.size else 0
+        U, singular, V = np.linalg.svd(columns / weights, full_matrices=False)
+        step[: self.nq][movable] = V[:rank].T @ ((U[:, :rank].T @ unforced @ right) / singular[:rank]) / weights
         step /= max(1.0, np.abs(step[: self.nq][angles]).max(initial=0.0))  # a radian at most
         step[self.nq :] = np.linalg.lstsq(of_mu, right - of_q @ step[: self.nq], rcond=RANK)[0]
         return step
@@ -101,27 +107,28 @@ class Rests:
         """
         first = np.array([guess.get(name, zero) for name, zero in self.zero.items()], dtype=float)
         known, movable = np.isin(self.coordinates, list(guess)), ~np.isin(self.coordinates, list(fixed))
-        angles = self._angles(t, p, first)
-        found, reason, sizes = [], None, None
-        for turned in self._turns(angles & ~known & movable):
+        angles, sizes = self._angles(t, p, first), next(roots_of_inertia(self._frame, t, first, p))
+        found, reason, weights = [], None, sizes * np.where(known, GUESSED, 1.0)
+        balanced, _, _ = self.reached(t, p, first, movable & ~known, sizes, slice(self.n), angles)
+        for turned in self._turns(angles & movable):
             if found and 0.5 in np.abs(turned):
                 break
-            q = self._met(t, p, first + turned * np.pi, known, movable, angles)
-            sizes = next(roots_of_inertia(self._frame, t, q, p)) if sizes is None else sizes
-            weights = sizes * np.where(known, GUESSED, 1.0)
-            z, rests, worst = self.reached(t, p, q, movable, weights, angles=angles)
-            reason = reason or worst
-            if rests and not any(self._alike(z, other, angles) for other in found):
-                z[: self.nq] += angles * 2 * np.pi * np.round((first - z[: self.nq]) / (2 * np.pi))
-                found.append(z)
+            for start in (first, balanced[: self.nq]):
+                q = self._met(t, p, start + turned * np.pi, known, movable, angles, sizes)
+                z, rests, worst = self.reached(t, p, q, movable, weights, angles=angles)
+                reason = reason or worst
+                if rests and not any(self._alike(z, other, angles) for other in found):
+                    z[: self.nq] += angles * 2 * np.pi * np.round((first - z[: self.nq]) / (2 * np.pi))
+                    found.append(z)
         return self._ordered(t, p, found, first, known, angles, sizes), reason
 
     @staticmethod
     def _turns(angles):
         """By how many half turns angles are turned: none, each, all, and where no rest was found all by a quarter."""
         yield 0.0 * angles
-        yield from np.eye(len(angles))[angles]
-        yield from (k * angles for k in (1.0, 0.5, -0.5))
+        if angles.any():
+            yield from np.eye(len(angles))[angles]
+            yield from (k * angles for k in (1.0, 0.5, -0.5))
 
     def _alike(self, z, other, angles):
         """Whether rests differ by full turns only."""
@@ -138,13 +145,13 @@ class Rests:
         whole, other = (np.abs(np.subtract(some, changed[0])).max(axis=1, initial=0.0) for some in changed[1:])
         return whole < UNDECIDED * other
 
-    def _met(self, t, p, q, known, movable, angles):
-        """q on the constraints and the program by actuators, by what nobody guessed, by anything; lengths first."""
+    def _met(self, t, p, q, known, movable, angles, sizes):
+        """q on the constraints and the program by what nobody guessed, driven lengths first, at last by anything."""
         V, _, E = (np.array(part) for part in self._frame(t, q, p))
         driven, lengths, first = np.abs(V @ E).max(axis=1, initial=0.0) > 0, ~angles, q
-        for some in (driven & lengths, ~known & lengths, driven, ~known, movable):
+        for some in (driven & lengths & ~known, lengths & ~known, driven & ~known, ~known, movable):
             near = q if some is movable else first
-            z, there, _ = self.reached(t, p, near, movable & some, 1.0, slice(self.n, None), angles)
+            z, there, _ = self.reached(t, p, near, movable & some, sizes, slice(self.n, None), angles)
             q = z[: self.nq]
             if there:
                 break
