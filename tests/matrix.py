@@ -163,7 +163,7 @@ def from_other_guesses(name, log):
         signs = [1.0 if part > 0 else -((-1.0) ** i) for i in range(len(free))]
         guess = {n: float(start[n] + abs(part) * s * d) for n, s, d in zip(free, signs, sizes, strict=True)}
         rates = np.abs(run.jets[build[0].q.nq :])
-        if rates[:, 0].max() > 1e-6 * rates.max():
+        if rates[:, 0].max() > 1e-3 * rates.max():  # a bounded motion has almost left its rest
             log.add(name, label, **_in_motion(build, scene, guess))
         else:
             other, facts_there, more = plan(build, scene.t_span, guess, {})
