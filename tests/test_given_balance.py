@@ -61,3 +61,17 @@ def test_products_of_decimals_in_either_order_are_symmetric():
     assert weight * 0.1 * 0.3 != weight * 0.3 * 0.1
     balance = ca.vertcat(*q.d(2)) + weight * along * q.dt(0.1 * a + 0.3 * b, 2)
     assert sv.Mechanism(q, balance=balance).mass.shape == (2, 2)
+
+
+def test_a_given_balance_has_the_relaxed_plan_of_its_machine():
+    """What the balance holds at rest, such as gravity, once came to it again as forces, which then was refused."""
+    q = sv.coordinates("x th")
+    x, th = q
+    load = ca.vertcat(x + 5 * ca.sin(th), -5 * ca.cos(th))
+    S = sv.particle(q, 2.5, x) + sv.particle(q, 60.0, load)
+    crane = sv.Mechanism(q, S, potential=60 * 9.81 * load[1], actuators={"f": x})
+    given = sv.Mechanism(q, balance=crane.balance, actuators={"f": x})
+    path = sv.paths.rest_to_rest(q.t, 0.0, 3.0, duration=6.0, smoothness=4)
+    program = sv.Program({"load": load[0] - path})
+    plan, other = (sv.relaxed(sv.plant(each), program, (0.0, 6.0)) for each in (crane, given))
+    assert np.abs(plan["f"] - other["f"]).max() < 1e-9 * np.abs(plan["f"]).max()

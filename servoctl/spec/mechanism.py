@@ -277,7 +277,7 @@ class Mechanism(Shown):
         driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
         driven = Mechanism(
             self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
-            balance=self._inverse_dynamics, mass=self._mass, forces=self.forces - self._added + forces + driving,
+            balance=self._inverse_dynamics, mass=self._mass, forces=self._applied - self._added + forces + driving,
             constraints=self.constraints, outputs={**self.outputs, **inputs},
             shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
         )  # fmt: skip
