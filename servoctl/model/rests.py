@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.reduction.rows import Row
-from servoctl.tolerances import TINY
+from servoctl.tolerances import ENTRY, TINY
 
 NEWTON = 25  # steps
 MET = 1e-9  # largest row at a rest, relative to its slopes times the state
@@ -92,6 +92,7 @@ class Rests:
         unforced = left[:, np.sum(singular > RANK * singular.max(initial=0.0)) :].T
         step, right = np.zeros(slopes.shape[1]), -rows / sizes[:, 0]
         columns, weights = (unforced @ of_q)[:, movable], weights[movable]
+        columns = np.where(np.abs(columns) > ENTRY, columns, 0.0)
         largest = np.maximum(np.abs(columns).max(axis=0, initial=0.0), TINY)
         rank = np.linalg.matrix_rank(columns / largest, rtol=RANK) if columns.size else 0
         U, singular, V = np.linalg.svd(columns / weights, full_matrices=False)
@@ -166,19 +167,19 @@ class Rests:
         guessed, turned, far = map(np.array, lists)
         near = np.flatnonzero(_smallest(guessed))
         left = near[_smallest(turned[near])]
-        heights = np.array([self._lifted(t, p, found[left[0]], found[i]) for i in left[1:]])
-        left = left[_smallest(np.append(0.0, heights))]
+        heights, terms = np.transpose([(0.0, 0.0), *(self._lifted(t, p, found[left[0]], found[i]) for i in left[1:])])
+        left = left[_smallest(heights, terms.max())]
         left = left[_smallest(far[left])]
         return [found[left[0]], *(found[i] for i in near if i != left[0])]
 
     def _lifted(self, t, p, one, other):
-        """The potential energy of a state above that of another, by the work of the forces at rest."""
-        way, work = (other - one)[: self.nq], 0.0
+        """The potential energy of a state above that of another, by the work of the forces at rest, and its terms."""
+        way, works = (other - one)[: self.nq], []
         for at, weight in zip(*np.polynomial.legendre.leggauss(NEWTON // 2), strict=True):
             z = np.concatenate([one[: self.nq] + 0.5 * (1 + at) * way, np.zeros(len(one) - self.nq)])
             V = np.array(self._frame(t, z[: self.nq], p)[0])
-            work += 0.5 * weight * (self.measured(t, z, p)[0][: self.n] @ np.linalg.pinv(V) @ way)
-        return work
+            works.append(0.5 * weight * (self.measured(t, z, p)[0][: self.n] * (np.linalg.pinv(V) @ way)))
+        return np.sum(works), np.abs(works).sum()
 
 
 def frame(mechanism):
@@ -199,9 +200,9 @@ def roots_of_inertia(frame, t, q, p):
         yield np.where(heavy, roots, roots[heavy].min(initial=np.inf) if heavy.any() else 1.0)
 
 
-def _smallest(values):
-    """Which values are the least, but for what decides nothing."""
-    return values - values.min() <= UNDECIDED * np.abs(values).max()
+def _smallest(values, size=0.0):
+    """Which values are the least, but for what decides nothing; a `size` of their terms."""
+    return values - values.min() <= UNDECIDED * max(np.abs(values).max(), size)
 
 
 def _still(q, expressions):
