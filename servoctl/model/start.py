@@ -419,7 +419,7 @@ def _largest(equations, x):
     return float(np.nan_to_num(np.abs(equations.scaled(x)), nan=np.inf).max(initial=0.0))
 
 
-def _nearest(equations, x, aim, iterations=40):
+def _nearest(equations, x, aim, iterations=200):
     """The solution nearest the reference, by successive projection; a state without values where that is singular."""
     for _ in range(iterations):
         value, jacobian = equations(x)
