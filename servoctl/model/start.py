@@ -19,7 +19,7 @@ TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; 
 TRIES = 6  # initial points of the iteration; the first is the reference
 FARTHER = 0.1  # distance of each further initial point from the reference, relative to the state's size
 SEED = 1788  # seed of these points
-THIRDS = 15  # of a step to a third, until the residual falls
+THIRDS = 4  # of a step to a third, until the residual falls; along shorter ones it creeps
 LEAPS = 3  # whole steps along which it may rise, as over a kink
 REACHED = 1e-16  # scaled residual at which the iteration ends
 REPEATED = 1e-12  # singular values below this fraction of the largest count as zero
@@ -432,7 +432,7 @@ def _largest(equations, x):
     return float(np.nan_to_num(np.abs(equations.scaled(x)), nan=np.inf).max(initial=0.0))
 
 
-def _nearest(equations, x, aim, iterations=40):
+def _nearest(equations, x, aim, iterations=200):
     """The solution nearest the reference, by successive projection; a state without values where that is singular."""
     for _ in range(iterations):
         value, jacobian = equations(x)
