@@ -700,6 +700,6 @@ def test_a_guess_that_no_state_is_near_is_printed_with_its_distance():
 
 
 def test_an_angle_that_looks_like_degrees_is_printed_in_radians():
-    model = sv.derive(*gallery["pendubot"].build())
-    assert "90 degrees are 1.571" in str(model.start(guess={"q1": 90.0}))
-    assert "degrees" not in str(model.start(guess={"q1": 2.5}))
+    model = sv.derive(*gallery["overhead-crane"].build(), guess={"l": 4.0})
+    assert "45 degrees are 0.7854" in str(model.start(guess={"l": 4.0, "theta": 45.0}))
+    assert "degrees" not in str(model.start(guess={"l": 40.0, "theta": 2.5}))

@@ -32,10 +32,18 @@ def first_transient(run, motion):
     values = ", ".join(f"{name} = {run[name][0]:.4g}" for name in start.held or start.free if name in run.names)
     cause = f", as {values} {'was held' if start.held else 'was left free'}" * bool(values)
     for state in _attracted(run, run.t[falls[a]], motion):
-        if call := _call(state, model, later + rounding):
+        call = _call(state, model, later + rounding) if _nearer(run, state, falls[a]) else ""
+        if call:
             told = f"{names[a]} has a first transient of {first} {run.unit(names[a])}".rstrip()
             return f"{told} and is at most {most} later{cause}. Start without it: {call}"
     return ""
+
+
+def _nearer(run, state, k):
+    """Whether a state lies as near as the run's start to where it moves from its sample k on: on the same branch."""
+    later, nq = run.jets[: run.model.nq, k:].T, run.model.nq
+    found, first = (np.linalg.norm(x[:nq] - later, axis=1).min() for x in (state.values, run.jets[:, 0]))
+    return found <= first
 
 
 def _attracted(run, fallen, motion):

@@ -108,7 +108,7 @@ class Rests:
         """
         first = np.array([guess.get(name, zero) for name, zero in self.zero.items()], dtype=float)
         known, movable = np.isin(self.coordinates, list(guess)), ~np.isin(self.coordinates, list(fixed))
-        angles, sizes = self._angles(t, p, first), next(roots_of_inertia(self._frame, t, first, p))
+        angles, sizes = self.angles(t, p, first), next(roots_of_inertia(self._frame, t, first, p))
         found, reason, weights = [], None, sizes * np.where(known, GUESSED, 1.0)
         balanced, _, _ = self.reached(t, p, first, movable & ~known, sizes, slice(self.n), angles)
         for turned in self._turns(angles & movable):
@@ -137,7 +137,7 @@ class Rests:
         apart -= angles * 2 * np.pi * np.round(apart / (2 * np.pi))
         return bool(np.all(np.abs(apart) <= UNDECIDED * (1.0 + np.abs(other[: self.nq]))))
 
-    def _angles(self, t, p, q):
+    def angles(self, t, p, q):
         """Coordinates that a full turn leaves as they are, and another change does not."""
         z = np.random.default_rng(0).uniform(-1.0, 1.0, self.function.size1_in(1))
         z[: self.nq] += q

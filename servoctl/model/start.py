@@ -19,7 +19,7 @@ TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; 
 TRIES = 6  # initial points of the iteration; the first is the reference
 FARTHER = 0.1  # distance of each further initial point from the reference, relative to the state's size
 SEED = 1788  # seed of these points
-THIRDS = 4  # of a step to a third, until the residual falls; along shorter ones it creeps
+THIRDS = 15  # of a step to a third, until the residual falls
 LEAPS = 3  # whole steps along which it may rise, as over a kink
 REACHED = 1e-16  # scaled residual at which the iteration ends
 REPEATED = 1e-12  # singular values below this fraction of the largest count as zero
@@ -218,19 +218,27 @@ def consistent(model, t, held, guess, hold):
     x = branches[0]
     left = tuple(name for name in free_names(equations, x, aim, chosen) if name in states)
     fixed, residual = tuple(dict.fromkeys((*held, *conditions))), _largest(equations, x)
-    notes = tuple(_notes(chosen, guess, dict(zip(states, x.tolist(), strict=False)), q.units))
+    notes = tuple(_notes(model, t, chosen, guess, dict(zip(states, x.tolist(), strict=False))))
     return State(t, x[:n_x], states, fixed, left, residual, branches=branches[:, :n_x], notes=notes)
 
 
-def _notes(given, guess, state, units):
-    """On the guessed value that a state is farthest from, and on given angles that are whole turns in degrees."""
+def _notes(model, t, given, guess, state):
+    """On the guessed value that a state is farthest from, and on given angles that are round numbers of degrees."""
     away = {abs(state[name] - value): name for name, value in guess.items()}
-    if away and max(away) > DISTINCT * (1.0 + np.abs([*state.values()]).max()):
-        name = away[max(away)]
-        yield f"nearest to the guess, {max(away):.4g} off: {name} = {state[name]:.4g}, guessed {guess[name]:.4g}"
-    for name, value in given.items():
-        if units.get(name) == "rad" and abs(value) > 2 * np.pi and value % 5 == 0:
+    name, far = away.get(max(away, default=0.0)), max(away, default=0.0)
+    if name is not None and far > DISTINCT * (1.0 + abs(guess[name])):
+        shown = without_rounding(np.array([guess[name], state[name]]))[1]
+        yield f"nearest to the guess, {far:.4g} off: {name} = {shown:.4g}, guessed {guess[name]:.4g}"
+    coordinates = {name: value for name, value in given.items() if name in model.coordinate_names}
+    turned = {name: value for name, value in coordinates.items() if abs(value) > 2 * np.pi and value % 5 == 0}
+    angles = _all_rests(model).angles(t, model.parameters, np.zeros(model.nq)) if turned else ()
+    for name, value in turned.items():
+        if angles[model.coordinate_names.index(name)]:
             yield f"{name} = {value:g} is in radians; {value:g} degrees are {np.radians(value):.4g}"
+
+
+def _all_rests(model):
+    return model.once("rests", lambda: Rests.of_model(model))
 
 
 def _rests(model, equations, aim, held, conditions):
@@ -239,10 +247,9 @@ def _rests(model, equations, aim, held, conditions):
     rates = held.keys() - set(q.names)
     if not any(ca.depends_on(e, q.t) for e in residuals) or any(held[name] for name in rates):
         return None
-    rests = model.once("rests", lambda: Rests.of_model(model))
     chosen = zip(q.names, aim.reference, aim.guessed | ~aim.movable, strict=False)
     guess = {name: value for name, value, known in chosen if known}
-    found, _ = rests.nearest(t, model.parameters, guess, held.keys() - rates)
+    found, _ = _all_rests(model).nearest(t, model.parameters, guess, held.keys() - rates)
     states = [np.concatenate([z[: q.nq], np.zeros(len(aim.names) - q.nq)]) for z in found]
     jets = np.append(states[0][: len(model.state_names)], np.zeros(model.n)) if states else None
     if states and not _largest(equations, states[0]) < TOLERANCE:
@@ -400,7 +407,7 @@ def _step(value, jacobian, aim):
 
 
 @np.errstate(all="ignore")  # what is not finite is no solution
-def gauss_newton(equations, x, aim, iterations=60):
+def gauss_newton(equations, x, aim, iterations=200):
     """Damped Gauss-Newton with least steps.
 
     A step is judged by the gradients at its start: relative to gradients that shrink along it, residuals that fall
@@ -440,7 +447,9 @@ def _nearest(equations, x, aim, iterations=200):
             trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
         trial = gauss_newton(equations, trial, aim, 12)
         distance, before = (np.linalg.norm(aim.weights * (y - aim.reference)) for y in (trial, x))
-        if not (_largest(equations, trial) < TOLERANCE and distance <= before * (1 + TOLERANCE)):
+        off = np.abs(equations.scaled(trial)).max(initial=0.0)
+        slack = TOLERANCE if np.isfinite(off) else -REPEATED  # what has no values must be nearer
+        if off > TOLERANCE or not distance <= before * (1 + slack):
             break
         x, change = trial, np.linalg.norm(aim.weights * (trial - x))
         if change <= REPEATED * before:
@@ -517,7 +526,8 @@ def _refuse(equations, aim, held, x):
         largest, worst = max(zip(residuals, equations.rows, strict=True))
         what = [f"{name} = {held[name]:g}" for name, _ in others]
         what += [f"the invariant {worst!r} (residual {largest:.2e})"] if worst in alone.rows else []
-        what = " and ".join(what) or f"the constraints with {', '.join(name for name in held if name != change)} held"
+        held_too = f" with {', '.join(name for name in held if name != change)} held" * (len(held) > 1)
+        what = " and ".join(what) or f"the constraints{held_too}"
         raise InconsistentStart(
             f"{change} = {held[change]:g} contradicts {what}.",
             "Held values satisfy every constraint and its time derivatives.",
