@@ -269,7 +269,18 @@ class Model(Detailed):
         return self._variants[key]
 
     def there(self, t, jets):
-        """The model, or where its pivots vanish at t [s] and jets (n_z,) the one with pivots chosen there, if any."""
+        """The model, or where its pivots vanish the one with pivots chosen there, if any.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        jets : (n_z,) array
+
+        Returns
+        -------
+        Model
+        """
         try:
             return self if self.strength(t, jets) > RESOLVED else self.near(t, jets)
         except ServoError:
