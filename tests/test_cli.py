@@ -332,7 +332,7 @@ def test_errors_are_told_without_a_traceback(here, fall, capsys, arguments, fact
         ("run fall.py --set =3", "'=3' is not NAME=VALUE"),
         ("run fall.py --set m=nan", "'m=nan' is not NAME=VALUE with a number"),
         ("run --hold y=1 fall.py", "the scene's name comes before such options"),
-        ("run fall.py --drift much", "'much' is not none, project, minimal or a time constant"),
+        ("run fall.py --drift much", "'much' is not none, project or a time constant"),
         ("run fall.py --samples 1", "'1' is not a whole number of at least 2"),
         ("run fall.py --t-spam 0 1", "unrecognized argument '--t-spam'; nearest: --t-span."),
         ("run fall.py --no-figures --all-figures", "not allowed with"),

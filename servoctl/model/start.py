@@ -352,7 +352,7 @@ def _by_blocks(model, t, equations, aim):
 
 def _by_levels(equations, x, aim, model):
     """The state near x that is nearest to guessed coordinates, then to each guessed derivative, then to the rest."""
-    levels, movable = _levels(model, len(x)), aim.movable
+    levels, movable = _orders(model, len(x)), aim.movable
     for some in (*(aim.guessed & (levels == level) for level in range(levels[-1] + 1)), aim.movable & ~aim.guessed):
         movable = movable & ~some
         kept = gauss_newton(equations, np.where(some, aim.reference, x), replace(aim, movable=movable))
@@ -363,7 +363,7 @@ def _by_levels(equations, x, aim, model):
     return x
 
 
-def _levels(model, size):
+def _orders(model, size):
     """The derivative that each of the first jets is."""
     return np.maximum(0, np.arange(size) - model.nq + model.n) // model.n
 
@@ -499,7 +499,7 @@ def _clear_choice(x, y, aim, model):
     Of the reference the lowest derivatives in which they differ count.
     """
     differ = np.abs(y - x) > DISTINCT * (1.0 + np.abs(x))
-    levels = _levels(model, len(x))
+    levels = _orders(model, len(x))
     guessed = differ & aim.guessed
     lowest = guessed if guessed.any() else differ & (levels == levels[differ].min())
     between, way = (aim.sizes * (y - x))[lowest], (aim.sizes * (aim.reference - x))[lowest]
