@@ -529,7 +529,7 @@ def _require_decay(model, drift, t0, t1):
 def as_state(model, start, t0):
     """The state X (n_x,) that a start gives at t0."""
     if isinstance(start, Mapping):
-        given = ", ".join(f"{name}={value!r}" for name, value in start.items())
+        given = ", ".join(f"{name}={value}" for name, value in start.items())
         raise SpecificationError(
             f"The start is a dict of {', '.join(map(repr, start)) or 'nothing'}.",
             "A program determines further values at its start, so that it takes a state that satisfies all of it.",

@@ -263,6 +263,7 @@ class FreeEntries:
 
     # the internal dynamics
 
+    @np.errstate(invalid="ignore")  # a singular state has no linearisation
     def local(self, t, x):
         """The linearisation at states x (n_x, N): z' (N, f) and A (N, f, f) on the invariants, step back and tangent.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from servoctl.errors import ServoError
 from servoctl.markup import digits
-from servoctl.model.start import without_rounding
+from servoctl.model.start import STILL, without_rounding
 from servoctl.run import AGREES
 
 
@@ -15,7 +15,7 @@ def first_transient(run, motion):
 
     `motion(start, span)` is the run of the same model from a state over a span (t0, t1) [s].
     """
-    model, start, moves = run.model, run.start, run.jets[run.model.nq :, 0].any()  # at rest there is no transient
+    model, start, moves = run.model, run.start, np.abs(run.jets[run.model.nq :, 0]).max() > STILL  # at rest is none
     driven = model.reduction.mechanism.actuators and not model.ideal
     if not (moves and driven and model.free and start and run.success and run.t[0] < run.t[-1]):
         return ""

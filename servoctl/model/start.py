@@ -228,7 +228,7 @@ def _notes(model, t, given, guess, state):
     name, far = away.get(max(away, default=0.0)), max(away, default=0.0)
     if name is not None and far > DISTINCT * (1.0 + abs(guess[name])):
         shown = without_rounding(np.array([guess[name], state[name]]))[1]
-        yield f"nearest to the guess, {far:.4g} off: {name} = {shown:.4g}, guessed {guess[name]:.4g}"
+        yield f"the nearest state found is {far:.4g} off the guess: {name} = {shown:.4g}, guessed {guess[name]:.4g}"
     coordinates = {name: value for name, value in given.items() if name in model.coordinate_names}
     turned = {name: value for name, value in coordinates.items() if abs(value) > 2 * np.pi and value % 5 == 0}
     angles = _all_rests(model).angles(t, model.parameters, np.zeros(model.nq)) if turned else ()
@@ -440,18 +440,26 @@ def _largest(equations, x):
 
 
 def _nearest(equations, x, aim, iterations=200):
-    """The solution nearest the reference, by successive projection; a state without values where that is singular."""
+    """The solution nearest the reference, by successive projection; a state without values where that is singular.
+
+    Where a whole step leads no nearer, as where the solutions are bent more than the reference is far, a part does.
+    """
+    part, last = 1.0, np.inf
     for _ in range(iterations):
         value, jacobian = equations(x)
         with np.errstate(all="ignore"):
-            trial = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim)
-        trial = gauss_newton(equations, trial, aim, 12)
-        distance, before = (np.linalg.norm(aim.weights * (y - aim.reference)) for y in (trial, x))
+            step = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim) - x
+        trial = gauss_newton(equations, x + part * step, aim, 12)
+        distance, before, change = (np.linalg.norm(aim.weights * y) for y in (trial - aim.reference, x - aim.reference, trial - x))
         off = np.abs(equations.scaled(trial)).max(initial=0.0)
         slack = TOLERANCE if np.isfinite(off) else -REPEATED  # what has no values must be nearer
-        if off > TOLERANCE or not distance <= before * (1 + slack):
-            break
-        x, change = trial, np.linalg.norm(aim.weights * (trial - x))
+        hidden = abs(distance - before) <= TOLERANCE * before and change >= last  # by rounding
+        if off > TOLERANCE or not distance <= before * (1 + slack) or hidden:
+            part /= 3
+            if part < 3.0**-THIRDS:
+                break
+            continue
+        x, last = trial, change
         if change <= REPEATED * before:
             break
     return x
