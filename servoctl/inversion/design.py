@@ -610,7 +610,7 @@ class Search:
         along = null_space(np.vstack([active[balance > 0], 0 * x])).T
         try:
             bent = [g - gradient - (rows - active).T @ balance for g, rows in (slopes(x + ACTIVE * d) for d in along)]
-            rises = max((self.cost(v + ACTIVE * d[:k]) for d in along), default=0.0) - self.cost(v)
+            rises = max(self.cost(v + ACTIVE * d) for d in np.diag(np.where(v < 0.5, 1.0, -1.0))) - self.cost(v)
         except NoMotion:
             return float(first), None
         curvature, directions = np.linalg.eigh(np.reshape(bent, along.shape) @ along.T / ACTIVE)

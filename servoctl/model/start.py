@@ -450,7 +450,8 @@ def _nearest(equations, x, aim, iterations=200):
         with np.errstate(all="ignore"):
             step = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim) - x
         trial = gauss_newton(equations, x + part * step, aim, 12)
-        distance, before, change = (np.linalg.norm(aim.weights * y) for y in (trial - aim.reference, x - aim.reference, trial - x))
+        ways = trial - aim.reference, x - aim.reference, trial - x
+        distance, before, change = (np.linalg.norm(aim.weights * way) for way in ways)
         off = np.abs(equations.scaled(trial)).max(initial=0.0)
         slack = TOLERANCE if np.isfinite(off) else -REPEATED  # what has no values must be nearer
         hidden = abs(distance - before) <= TOLERANCE * before and change >= last  # by rounding
