@@ -157,7 +157,7 @@ def test_an_absent_name_says_how_to_include_it(beside, what):
         ABSENT[what](mechanism, run)
 
 
-@pytest.mark.parametrize("named", [{"phi0": 0.1}, {"guess": {"l": 4.0, "dphi0": 0.1}}])
+@pytest.mark.parametrize("named", [{"phi0": 0.1}, {"dphi0": 0.1}])
 def test_a_start_that_names_a_coordinate_includes_it(beside, named):
     """The pendulum swings beside the same plan of the crane, and all that takes the model takes the motion."""
     _, model, run = beside
