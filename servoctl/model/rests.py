@@ -202,6 +202,7 @@ def roots_of_inertia(frame, t, q, p):
 
 def _smallest(values, size=0.0):
     """Which values are the least, but for what decides nothing; a `size` of their terms."""
+    values = np.nan_to_num(values, nan=np.inf)  # of guesses beyond what can be squared none is nearer
     return values - values.min() <= UNDECIDED * max(np.abs(values).max(), size)
 
 
