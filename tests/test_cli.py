@@ -241,8 +241,7 @@ def test_a_start_may_hold_outputs(here):
     outputs = 'outputs={"distance": (x**2 + (y + 1) ** 2) ** 0.5, "speed": q.dt(y)}, parameters=p)'
     text = FALL.replace("parameters=p)", outputs).replace('START = {"y": 0.0, "dy": 0.0}', 'START = {"distance": 3.0}')
     (here / "far.py").write_text(text + '\nGUESS = {"y": 1.0}\n', encoding="utf-8")
-    for command in ("run far.py --no-verify --no-figures --no-loop", "sweep far.py --vary m=1:2:2"):
-        assert main([*command.split(), "--hold", "speed=0.5"] if "run" in command else command.split()) == 0, command
+    assert main([*"run far.py --no-verify --no-figures --no-loop --hold".split(), "speed=0.5"]) == 0
     start = summary(here / "servoctl-runs" / "far")["start"]
     assert start["held"] == ["distance", "speed"]
     assert start["values"]["y"] == pytest.approx(2.0, abs=1e-12) and start["values"]["dy"] == pytest.approx(0.5)
@@ -428,10 +427,9 @@ def test_what_no_model_has_is_told_before_deriving(fall, capsys, monkeypatch, op
     assert fact in words(capsys.readouterr().err)
 
 
-@pytest.mark.parametrize("command", ["run", "sweep"])
-def test_help_names_every_method(capsys, command):
+def test_help_names_every_method(capsys):
     with pytest.raises(SystemExit):
-        main([command, "--help"])
+        main(["run", "--help"])
     assert ", ".join(ALL_METHODS) in words(capsys.readouterr().out)
 
 
@@ -593,6 +591,13 @@ def test_a_reader_that_leaves_does_not_end_the_computation(here, fall):
     }
 
 
+def test_export_c_writes_two_files(here, capsys):
+    assert main(["export-c", "two-cars", "--out", "c", "--set", "k1=2"]) == 0
+    assert sorted(p.name for p in Path("c").iterdir()) == ["two_cars.c", "two_cars.h"]
+    assert "two_cars.c, two_cars.h in c" in capsys.readouterr().out
+    assert main(["export-c", "two-cars", "--out", "c", "--name", "int"]) == 2
+
+
 LONG = "n" * 300
 
 
@@ -600,18 +605,14 @@ LONG = "n" * 300
     "argv",
     [
         ["run", ""], ["run", LONG], ["run", "a\0b"], ["run", "a\0.py"], ["run", "\ud800.py"], ["report", ""],
-        ["report", LONG], ["report", "a\0b"], ["sweep", "a\0.py", "--vary", "m=1:2:3"],
-        ["sweep", "--merge", "a\0b"], ["sweep", "--merge", LONG], ["export-c", "overhead-crane", "--out", LONG],
+        ["report", LONG], ["report", "a\0b"], ["export-c", "overhead-crane", "--out", LONG],
         ["export-c", "overhead-crane", "--out", "a\0b"],
         *(["run", "overhead-crane", "--out", out] for out in (LONG, "a\0b", "\ud800", f"{LONG}/{LONG}")),
         *([command, "overhead-crane", "--out", "a\0b"] for command in ("tradeoff", "run")),
-        ["sweep", "overhead-crane", "--vary", "m_load=1:2:99999", "l=1:2:99999"],
-        ["sweep", "overhead-crane", "--vary", "m_load=1:2:99999", "--monte-carlo", "99999", "--draw", "l=normal:1:1",
-         "--seed", "1"],
     ],
     ids=lambda argv: " ".join(word[:12] for word in argv).encode("ascii", "backslashreplace").decode(),
 )  # fmt: skip
-def test_odd_names_and_too_many_cases_are_explained(argv, capsys):
+def test_odd_names_are_explained(argv, capsys):
     assert main(argv) == 2
     said = capsys.readouterr().err
     assert "Error" in said or "NameUnknown" in said
@@ -622,9 +623,6 @@ def test_odd_names_and_too_many_cases_are_explained(argv, capsys):
     "argv",
     [
         ["run", "overhead-crane", "--samples", "99999999999"], ["run", "overhead-crane", "--samples", "1" * 5000],
-        ["sweep", "overhead-crane", "--vary", "m_load=1:2:999999999999"],
-        ["sweep", "overhead-crane", "--vary", "m_load=1:2:" + "9" * 5000],
-        ["sweep", "overhead-crane", "--monte-carlo", "99999999999", "--draw", "m_load=normal:100:5", "--seed", "1"],
     ],
     ids=lambda argv: " ".join(argv[2:4])[:30],
 )  # fmt: skip

@@ -20,7 +20,6 @@ from refusals import refused
 import servoctl as sv
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import overhead_crane
-from servoctl.shell.main import main
 from servoctl.study.cases import FAILURE
 
 LOADS = {"m_load": lambda rng: rng.normal(115.0, 5.0)}
@@ -421,109 +420,6 @@ def test_the_figure_shows_each_of_few_results():
 
 def test_a_sweep_of_functions_pickles_by_name():
     assert pickle.loads(pickle.dumps(halves)) is halves
-
-
-# the command ---------------------------------------------------------------------------------------------------------
-
-
-OWN = '''"""Half of a number, and a random one."""
-def case(m, rng):
-    if m == 4:
-        raise ValueError("four")
-    return {"half": m / 2, "random": rng.normal()}
-'''
-
-
-@pytest.fixture
-def here(here):
-    (here / "own.py").write_text(OWN, encoding="utf-8")
-    return here
-
-
-def test_the_command_varies_parameters_of_a_scene(here, capsys):
-    assert main(["sweep", "two-cars", "--vary", "m1=1:2:3", "--vary", "k1=1,2", "--out", "out"]) == 0
-    study = sv.load_study("out/sweep.npz")
-    assert study["m1"].tolist() == [1.0, 1.0, 1.5, 1.5, 2.0, 2.0] and study["k1"].tolist() == [1.0, 2.0] * 3
-    assert sorted(p.name for p in Path("out").iterdir()) == [f"sweep.{s}" for s in ("csv", "json", "npz", "png")]
-    assert "6 of 6 cases finished" in capsys.readouterr().out
-    assert json.loads(Path("out/sweep.json").read_text(encoding="utf-8"))["parameters"] == ["m1", "k1"]
-
-
-def test_shards_of_the_command_merge_to_the_table_of_one_process(here):
-    own = ["sweep", "own.py", "--vary", "m=1:5:5", "--monte-carlo", "2", "--seed", "3"]
-    assert main([*own, "--out", "whole"]) == 1, "case 4 fails"
-    assert [main([*own, "--shard", f"{i}/2", "--out", "parts"]) for i in (1, 2)] == [1, 1]
-    assert main(["sweep", "--merge", "parts", "--out", "merged"]) == 1
-    assert main(["sweep", "--merge", "parts", "nowhere"]) == 2, "no part is missed silently"
-    for path in Path("parts").glob("sweep-2-of-2.*"):
-        path.unlink()
-    assert main(["sweep", "--merge", "parts", "--out", "half"]) == 1 and len(sv.load_study("half/sweep.npz")) == 5
-    whole = sv.load_study("whole/sweep.npz")
-    assert same(whole, sv.load_study("merged/sweep.npz"))
-    assert len(whole) == 10 and (whole["error"] != "").tolist() == [False] * 6 + [True] * 2 + [False] * 2
-
-
-def test_the_command_on_two_processes_gives_the_same_bits(here):
-    own = ["sweep", "own.py", "--vary", "m=1,2,3", "--monte-carlo", "2", "--seed", "3"]
-    assert main([*own, "--out", "one"]) == main([*own, "--workers", "2", "--out", "two"]) == 0
-    assert same(sv.load_study("one/sweep.npz"), sv.load_study("two/sweep.npz"))
-
-
-def test_the_command_resumes_and_does_not_throw_work_away(here, capsys):
-    own = ["sweep", "own.py", "--vary", "m=1,2,3", "--monte-carlo", "1", "--seed", "3", "--out", "out"]
-    text = OWN.replace("if m == 4:", 'if m == 3 and not __import__("os").path.exists("go"):')
-    (here / "own.py").write_text(text.replace('ValueError("four")', "KeyboardInterrupt"), encoding="utf-8")
-    assert main(own) == 1
-    assert "interrupted" in capsys.readouterr().out and Path("out/sweep.jsonl").exists()
-    assert main(own) == 2
-    assert "--resume" in capsys.readouterr().err
-    (here / "go").write_text("", encoding="utf-8")
-    assert main([*own, "--resume"]) == 0
-    assert sv.load_study("out/sweep.npz").meta["message"] == "3 of 3 cases finished"
-    assert not Path("out/sweep.jsonl").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (["two-cars"], "Neither --vary nor --monte-carlo"),
-        (["two-cars", "--vary", "mm=1,2"], "No parameter or state is named 'mm'"),
-        (["two-cars", "--monte-carlo", "2", "--draw", "m1=normal:1:0.1"], "There is no --seed"),
-        (["two-cars", "--vary", "m1=1,2", "--seed", "1"], "nothing is random"),
-        (["two-cars", "--draw", "m1=normal:1:0.1", "--seed", "1"], "without --monte-carlo"),
-        (["two-cars", "--vary", "m1=1", "--draw", "m1=normal:1:1", "--monte-carlo", "2"], "m1 is both varied and drawn"),
-        (["two-cars", "--vary", "m1=1,2", "--vary", "m1=3"], "--vary m1 was given twice"),
-        (["own.py", "--vary", "m=1,2", "--method", "RK4"], "by its own case"),
-        (["own.py", "--vary", "k=1,2", "--seed", "1"], "missing a required argument: 'm'"),
-        (["none.py", "--vary", "m=1,2"], "There is no file none.py"),
-        (["--merge", "nowhere"], "There are no shards in nowhere"),
-        (["--merge", "nowhere", "--vary", "m=1", "--seed", "0", "--workers", "1"], "--vary, --seed, --workers was given"),
-        (["own.py", "--vary", "m=1,2"], "There is no --seed"),
-        (["two-cars", "--monte-carlo", "2"], "--monte-carlo was given, and nothing is random"),
-        (["two-cars", "--monte-carlo", "2", "--draw", "m1=normal:1:-1", "--seed", "1"], "m1 cannot be drawn: scale < 0"),
-        ([], "was given no scene"),
-    ],
-)  # fmt: skip
-def test_the_command_refuses(here, capsys, options, text):
-    assert main(["sweep", *options, "--out", "out"]) == 2
-    assert re.search(text, " ".join(capsys.readouterr().err.split()))
-    assert not Path("out").exists(), "no folder is left"
-
-
-@pytest.mark.parametrize(
-    "options", [["--vary", "m=1:2"], ["--vary", "m"], ["--draw", "m=gauss:1:2"], ["--shard", "3/2"], ["--workers", "0"]]
-)
-def test_values_of_another_form_are_refused_by_the_parser(here, capsys, options):
-    with pytest.raises(SystemExit):
-        main(["sweep", "two-cars", *options])
-    assert "argument" in capsys.readouterr().err
-
-
-def test_export_c_writes_two_files(here, capsys):
-    assert main(["export-c", "two-cars", "--out", "c", "--set", "k1=2"]) == 0
-    assert sorted(p.name for p in Path("c").iterdir()) == ["two_cars.c", "two_cars.h"]
-    assert "two_cars.c, two_cars.h in c" in capsys.readouterr().out
-    assert main(["export-c", "two-cars", "--out", "c", "--name", "int"]) == 2
 
 
 def test_more_cases_than_fit_into_memory_are_refused():

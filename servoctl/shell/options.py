@@ -1,9 +1,8 @@
-"""Values on the command line: NAME=VALUE, ranges, draws, shards."""
+"""Values on the command line: NAME=VALUE, ranges, numbers within bounds."""
 
 import argparse
 import math
 
-from servoctl.checks import MOST_CASES
 from servoctl.errors import SpecificationError
 from servoctl.methods.choice import METHODS
 
@@ -12,7 +11,6 @@ VERBOSE = {"action": "store_true", "help": "print the details of values, which r
 METHODS_HELP = f"{', '.join(METHODS)}; default: by the model"
 SCENE_HELP = "a gallery name, or a .py file that defines scene()"
 MANY = {"nargs": "+", "action": "extend", "default": []}  # options that take several values, and may be repeated
-DRAWS = {"normal": "MEAN:STD", "uniform": "LOW:HIGH", "lognormal": "MEDIAN:LOG_STD", "triangular": "LOW:MODE:HIGH"}
 
 
 def add_motion(parser):
@@ -86,56 +84,19 @@ def _at_least(least, most=math.inf):
     return _typed(lambda text: int(text) if text.isdecimal() and least <= int(text) <= most else None, form)
 
 
-def _values(text):
-    if ":" not in text:
-        return [float(part) for part in text.split(",")]
-    low, high, count = text.split(":")
-    low, high, count = float(low), float(high), int(count)
-    if not 2 <= count <= MOST_CASES:
-        return None
-    return [low + (high - low) * i / (count - 1) for i in range(count - 1)] + [high]
-
-
-def _draw(text):
-    kind, *numbers = text.split(":")
-    numbers = tuple(float(number) for number in numbers)
-    return (kind, *numbers) if kind in DRAWS and len(numbers) == DRAWS[kind].count(":") + 1 else None
-
-
 def _limits(text):
     low, high = (float(part) for part in text.split(":")) if ":" in text else (-float(text), float(text))
     return (low, high) if low < high else None
-
-
-def _shard(text):
-    i, n = (int(part) if part.isdecimal() else 0 for part in text.split("/"))
-    return (i, n) if 1 <= i <= n else None
 
 
 def _drift(text):
     return text if text in ("none", "project") else float(text)
 
 
-whole, count = _at_least(0), _at_least(1)
-draws, samples = _at_least(1, MOST_CASES), _at_least(2, MOST_SAMPLES)
+whole, samples = _at_least(0), _at_least(2, MOST_SAMPLES)
 positive = _typed(_number(above=0.0), "not a positive number")
 drift = _typed(_drift, "not none, project or a time constant [s]")
-shard = _typed(_shard, "not I/N with I from 1 to N, such as 1/4")
 _pair = "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
 assignment = _named(_number(), _pair)
 deviation = _named(_deviation, "not NAME=STD with STD >= 0, such as theta=0.001")
 limits = _named(_limits, "neither NAME=LOW:HIGH nor NAME=SIZE, such as trolley=150")
-_varied = f"neither NAME=LOW:HIGH:N with N from 2 to {MOST_CASES} nor NAME=A,B,C, such as m_load=80:120:9"
-variation = _named(_values, _varied)
-_forms = ", ".join(f"NAME={kind}:{form}" for kind, form in DRAWS.items())
-draw = _named(_draw, f"none of {_forms}, such as m_load=normal:100:5")
-
-
-def drawn(kind, *numbers):
-    """The function of a numpy Generator for a distribution that `draw` has read."""
-    return {
-        "normal": lambda rng: rng.normal(*numbers),
-        "uniform": lambda rng: rng.uniform(*numbers),
-        "lognormal": lambda rng: numbers[0] * rng.lognormal(0.0, numbers[1]),
-        "triangular": lambda rng: rng.triangular(*numbers),
-    }[kind]

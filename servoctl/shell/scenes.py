@@ -1,6 +1,5 @@
 """A scene by name: from the gallery, or from a user's file."""
 
-import functools
 import importlib.util
 import math
 import os
@@ -70,27 +69,6 @@ def _from_file(path):
         )
     description = next(iter((module.__doc__ or "").strip().splitlines()), f"The scene of {path.name}.")
     return Scene(lambda: _built(path, scene), description, **_settings(path, module))
-
-
-def stamp(given):
-    """A key for caches: a gallery name, or a file with the time of its last change."""
-    path = Path(given)
-    return (str(path.resolve()), path.stat().st_mtime_ns) if os.path.isfile(path) else given
-
-
-def own_case(given):
-    """The function `case` of a user's file, for sweeps; None if it has none."""
-    from servoctl.gallery import gallery
-
-    path = Path(given)
-    if given in gallery or path.suffix != ".py":
-        return None
-    return getattr(_imported(path, stamp(given)), "case", None)
-
-
-@functools.cache
-def _imported(path, _):
-    return _module(path)
 
 
 def _import(path):
