@@ -82,7 +82,6 @@ HOMES = {  # of each public name: the module that defines it, or that it is; imp
     "load_study": "study.load",
     "loop": "robots.contact",
     "lqr": "control.lqr",
-    "merge": "study.sweep",
     "minimum_phase": "inversion.output",
     "monte_carlo": "study.cases",
     "output_feedback": "control.observer",

@@ -91,7 +91,6 @@ from servoctl.study.many import simulate_many as simulate_many
 from servoctl.study.power_law import Prediction as Prediction
 from servoctl.study.stability_map import StabilityMap as StabilityMap
 from servoctl.study.stability_map import stability as stability
-from servoctl.study.sweep import merge as merge
 from servoctl.study.sweep import sweep as sweep
 from servoctl.study.table import Study as Study
 from servoctl.study.tradeoff import TradeOff as TradeOff

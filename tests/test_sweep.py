@@ -1,4 +1,4 @@
-"""Sweeps: the same table whoever computes it, no failure and no finished work lost; cases, shards, checkpoints."""
+"""Sweeps: the same table whoever computes it, no failure and no finished work lost; cases."""
 
 import functools
 import json
@@ -104,15 +104,6 @@ def test_dask_gives_the_same_bits(loops):
         assert same(loops, sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2, executor=executor))
 
 
-def test_shards_merge_to_the_whole(loops):
-    parts = [sv.sweep(crane_loop, sv.monte_carlo(8, seed=1, **LOADS), seed=2, shard=(i, 3)) for i in (2, 3, 1)]
-    assert [part["case"].tolist() for part in parts] == [[1, 4, 7], [2, 5], [0, 3, 6]]
-    assert parts[0].meta["message"] == "3 of 3 cases finished"
-    whole = sv.merge(parts)
-    assert same(loops, whole) and whole.meta["message"] == "8 of 8 cases finished"
-    assert sv.merge(parts[:2]).meta["message"] == "5 of 8 cases finished"
-
-
 def test_the_script_of_the_docs_runs(tmp_path, monkeypatch, capsys):
     """With threads in place of its processes, which the tests above start."""
     text = (Path(__file__).parents[1] / "docs" / "sweeps.md").read_text(encoding="utf-8")
@@ -193,14 +184,9 @@ def test_cases_that_form_no_table_are_refused(cases, fact):
         (lambda: sv.monte_carlo(2, seed=1, m=lambda rng: rng.normal(1.0, -1.0)), {"name": "m"}),
         (lambda: sv.sweep(halves, sv.grid(m=1), executor=2), "executor=2"),
         (lambda: sv.sweep(halves, sv.grid(m=1), executor=ThreadPoolExecutor), "ThreadPoolExecutor"),
-        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(1.5, 2)), {"shard": (1.5, 2)}),
         (lambda: sv.sweep(halves, sv.grid(m=1), seed=1), {"seed": 1}),
         (lambda: sv.sweep(crane_loop, sv.grid(m_load=100)), {"seed": None}),
-        (lambda: sv.sweep(halves, sv.grid(m=1), shard=(3, 2)), {"shard": (3, 2)}),
         (lambda: sv.sweep(3, sv.grid(m=1)), "case is 3"),
-        (lambda: sv.merge([]), "0 studies"),
-        (lambda: sv.merge([3]), "1 studies"),
-        (lambda: sv.merge([sv.sweep(halves, sv.grid(m=i)) for i in (1, 2)]), "2 studies"),
     ],
 )
 def test_what_cannot_be_swept_is_refused(call, fact):
@@ -232,16 +218,14 @@ def test_results_that_fit_no_table_are_failures(result):
     assert row["error"] == "SpecificationError" and "returned" in row["message"]
 
 
-def test_a_pool_that_dies_leaves_what_was_finished(tmp_path):
-    kept = tmp_path / "kept.jsonl"
+def test_a_pool_that_dies_leaves_what_was_finished():
     with spawned(1) as pool:
-        study = sv.sweep(deadly, sv.grid(m=range(12)), executor=pool, checkpoint=kept)
+        study = sv.sweep(deadly, sv.grid(m=range(12)), executor=pool)
     done = study["case"][study["error"] == ""].tolist()
     assert len(study) == 12 and done == [0, 1, 2, 3, 4] and study.meta["lost"] == list(range(5, 12))
     assert set(study["error"][5:]) == {"BrokenProcessPool"}
     assert "did not finish this case" in study["message"][7]
     assert "7 not finished by the executor" in study.meta["message"]
-    assert len(kept.read_text(encoding="utf-8").splitlines()) == 1 + len(done), "what was lost is computed again"
 
 
 def test_a_pool_that_dies_at_once_is_an_error():
@@ -285,81 +269,6 @@ def test_a_case_that_swallows_ctrl_c_is_not_finished():
     assert study["r"].tolist() == [0.0, 1.0, 2.0] and study.meta["interrupted"]
 
 
-# checkpoints ---------------------------------------------------------------------------------------------------------
-
-
-class Counting:
-    """A case that counts its calls and may end by Ctrl-C."""
-
-    def __init__(self, stop=None):
-        self.called, self.stop = [], stop
-
-    def __call__(self, m, rng):
-        if m == self.stop:
-            raise KeyboardInterrupt
-        self.called.append(m)
-        return {"r": rng.normal(), "gap": math.nan}
-
-
-def test_a_sweep_goes_on_where_its_checkpoint_ends(tmp_path):
-    kept, cases = tmp_path / "folder" / "kept.jsonl", sv.grid(m=range(6))
-    whole = sv.sweep(Counting(), cases, seed=1)
-    assert len(sv.sweep(Counting(stop=4), cases, seed=1, checkpoint=kept)) == 4
-    text = kept.read_text(encoding="utf-8")
-    kept.write_text(text[:-9], encoding="utf-8")  # the last line was cut off when the machine lost its power
-    again = Counting()
-    assert same(whole, sv.sweep(again, cases, seed=1, checkpoint=kept))
-    assert again.called == [3, 4, 5]
-    assert same(whole, sv.sweep(Counting(stop=0), cases, seed=1, checkpoint=kept)), "nothing is computed"
-
-
-def test_a_failure_is_not_tried_again(tmp_path):
-    first = sv.sweep(picky, sv.grid(m=[1, 2]), checkpoint=tmp_path / "kept")
-    assert same(first, sv.sweep(picky, sv.grid(m=[1, 2]), checkpoint=tmp_path / "kept"))
-    assert len((tmp_path / "kept").read_text(encoding="utf-8").splitlines()) == 3
-
-
-@pytest.mark.parametrize(
-    ("case", "cases", "seed"),
-    [(Counting(), {"m": [1, 3]}, 1), (Counting(), {"m": [1, 2]}, 2), (lambda m, rng: {}, {"m": [1, 2]}, 1)],
-    ids=["cases", "seed", "function"],
-)
-def test_the_checkpoint_of_another_sweep_is_refused(tmp_path, case, cases, seed):
-    kept = tmp_path / "kept"
-    sv.sweep(Counting(), {"m": [1, 2]}, seed=1, checkpoint=kept)
-    text = kept.read_text(encoding="utf-8")
-    with refused(SpecificationError, path=str(kept)):
-        sv.sweep(case, cases, seed=seed, checkpoint=kept)
-    assert kept.read_text(encoding="utf-8") == text
-
-
-def test_a_function_of_the_same_name_in_another_module_is_another_sweep():
-    cases = sv.grid(m=[1.0])
-    studies = []
-    for module in ("one", "two"):
-        space = {"__name__": module}
-        exec("def case(m): return {'f': m}", space)
-        studies += [sv.sweep(case, cases) for case in (space["case"], functools.partial(space["case"]))]
-    first, _, second, _ = (study.meta["identity"] for study in studies)
-    assert first != second and studies[0].meta["case"] == studies[2].meta["case"] == "case"
-    assert studies[1].meta["identity"] != studies[3].meta["identity"]
-    with refused(SpecificationError, "2 studies"):
-        sv.merge([studies[0], studies[2]])
-
-
-@pytest.mark.parametrize("text", ["hello\n", "[]\n", "{}\n"])
-def test_a_file_that_is_no_checkpoint_is_left_alone(tmp_path, text):
-    (tmp_path / "notes").write_text(text, encoding="utf-8")
-    with refused(SpecificationError, path=str(tmp_path / "notes")):
-        sv.sweep(halves, {"m": [1]}, checkpoint=tmp_path / "notes")
-    assert (tmp_path / "notes").read_text(encoding="utf-8") == text
-
-
-def test_a_checkpoint_that_cannot_be_opened_is_told(tmp_path):
-    with refused(ServoError, path=str(tmp_path)):
-        sv.sweep(halves, {"m": [1]}, checkpoint=tmp_path)
-
-
 # tables and figures --------------------------------------------------------------------------------------------------
 
 
@@ -379,7 +288,6 @@ def test_a_study_is_saved_loaded_and_given_to_xarray(tmp_path):
     study = sv.sweep(picky, sv.grid(m=[1, 2, 3, 4]))
     loaded = sv.load_study(study.save(tmp_path / "study"))
     assert same(study, loaded) and loaded.meta == study.meta
-    assert same(sv.merge([loaded]), study)
     study.to_xarray().to_netcdf(tmp_path / "study.nc")
     with xarray.open_dataset(tmp_path / "study.nc") as data:
         assert np.array_equal(data["r"], study["r"], equal_nan=True)

@@ -18,7 +18,7 @@ def sweep(study, names=None, against=None, units=None):
     Parameters
     ----------
     study : Study
-        From `sweep` or `merge`.
+        From `sweep`.
     names : sequence of str, optional
         Columns; default: the first four results that vary.
     against : str, optional
@@ -39,7 +39,7 @@ def sweep(study, names=None, against=None, units=None):
     """
     if getattr(study, "kind", None) != "sweep":
         kind = f"Study of the kind {study.kind}" if hasattr(study, "kind") else type(study).__name__
-        raise SpecificationError(f"A {kind} was given.", do="Give a study from sv.sweep or sv.merge.", kind=kind)
+        raise SpecificationError(f"A {kind} was given.", do="Give a study from sv.sweep.", kind=kind)
     parameters = [name for name in study.meta["parameters"] if _varies(study, name)]
     results = [name for name in study.columns if name not in ("case", *study.meta["parameters"])]
     varying = [name for name in results if _varies(study, name)]

@@ -9,19 +9,17 @@ import pickle
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from os import PathLike
 
 import numpy as np
 
-from servoctl.checks import as_list, plain, whole
+from servoctl.checks import plain, whole
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.progress import progress_bar
 from servoctl.run import Run
 from servoctl.study.cases import FAILURE, RESERVED, as_cases, generator
-from servoctl.study.checkpoint import Checkpoint, by_case, identity
 from servoctl.study.table import Study, machine
 
 INTERRUPTED = 1  # status of a Run or Closed that Ctrl-C ended
@@ -33,8 +31,6 @@ def sweep(
     *,
     executor: Executor | None = None,
     seed: int | None = None,
-    checkpoint: str | PathLike | None = None,
-    shard: tuple[int, int] | None = None,
     progress: bool | None = None,
 ) -> Study:
     """Compute every case and gather the numbers in one table.
@@ -42,8 +38,6 @@ def sweep(
     On processors of one kind the table is the same, bit for bit, for any number of workers and any order. A case that
     raises becomes a row with the error instead of numbers. Where cases are motions of one model, or loops of one plant,
     that differ in numbers alone, `simulate_many` and `close_many` compute them in vector lanes, 1,000 times as fast.
-
-    Main arguments
 
     Parameters
     ----------
@@ -59,13 +53,6 @@ def sweep(
         It is not shut down.
     seed : int, optional
         Seed of `rng`; required if the case has a parameter `rng`, refused otherwise.
-
-    Other arguments
-
-    checkpoint : str or Path, optional
-        File to which finished rows are appended; a sweep of the same cases, seed and function continues after them.
-    shard : (i, n), optional
-        Compute only part i of n, i = 1 .. n: the cases with index i - 1, i - 1 + n, ... `merge` joins the parts.
     progress : bool, optional
         Show a progress bar; default: on a terminal, for work of more than a second.
 
@@ -78,76 +65,29 @@ def sweep(
     Raises
     ------
     SpecificationError
-        For cases that form no table, a seed that is missing or unused, a shard that does not exist, a case that
-        cannot be sent to processes, a checkpoint of another sweep.
+        For cases that form no table, a seed that is missing or unused, and a case that cannot be sent to processes.
     ServoError
-        If the pool died before the first case was finished, or the checkpoint cannot be written.
+        If the pool died before the first case was finished.
     """
     cases = as_cases(cases)
     seed = _seed(case, seed)
-    part = range(len(cases)) if shard is None else _part(shard, len(cases))
-    require_fitting(case, cases[0], seed)
+    _require_fitting(case, cases[0], seed)
     _require_sendable(case, executor)
-    name = name_of(case)
-    key = identity(f"{_module_of(case)}.{name}", cases, seed)
     computed = _in_turn if executor is None else functools.partial(_on, executor)
-    unfinished, interrupted = {}, False
-    with Checkpoint(checkpoint, key, len(cases)) as disk:
-        rows = {row["case"]: row for row in disk.rows if row["case"] in part}
-        todo = [(i, cases[i]) for i in part if i not in rows]
-        with progress_bar("sweep", progress, len(part), initial=len(rows), unit="case") as bar:
-            try:
-                for i, row, finished in computed(case, todo, seed):
-                    (rows if finished else unfinished)[i] = row
-                    if finished:
-                        disk.add(row)
-                    bar.update()
-            except KeyboardInterrupt:
-                interrupted = True
+    rows, unfinished, interrupted = {}, {}, False
+    with progress_bar("sweep", progress, len(cases), unit="case") as bar:
+        try:
+            for i, row, finished in computed(case, cases, seed):
+                (rows if finished else unfinished)[i] = row
+                bar.update()
+        except KeyboardInterrupt:
+            interrupted = True
     if unfinished and not rows:
-        raise died(next(iter(unfinished.values())), len(part))
-    meta = {"case": name, "identity": key, "seed": seed, "count": len(cases), "shard": list(shard) if shard else None}
-    meta |= {"parameters": list(cases[0]), "lost": sorted(unfinished), "interrupted": interrupted, "machine": machine()}
+        raise died(next(iter(unfinished.values())), len(cases))
+    meta = {"case": name_of(case), "seed": seed, "count": len(cases), "parameters": list(cases[0])}
+    meta |= {"lost": sorted(unfinished), "interrupted": interrupted, "machine": machine()}
     columns = _columns(cases, rows | unfinished)
-    return Study("sweep", columns, meta | {"message": _message(columns, meta, len(part))})
-
-
-def merge(studies: Study | Iterable[Study]) -> Study:
-    """Join the shards of a sweep in one table, in the order of the cases.
-
-    Parameters
-    ----------
-    studies : sequence of Study
-        From `sweep` with the same cases, seed and function. If a case occurs twice, its finished row is taken.
-
-    Returns
-    -------
-    Study
-
-    Raises
-    ------
-    SpecificationError
-        If there are none, if they belong to different sweeps, or if finished rows of one case differ.
-    """
-    studies = [studies] if isinstance(studies, Study) else as_list(studies) or []
-    keys = {getattr(study, "meta", {}).get("identity") for study in studies}  # None for what is not a sweep
-    if len(keys) != 1 or None in keys:
-        raise SpecificationError(
-            f"{len(studies)} studies of {len(keys)} different sweeps were given.",
-            "Only shards of one sweep form a table: of the same cases, seed and function.",
-            do="Merge the shards of each sweep separately.",
-            studies=len(studies),
-            sweeps=len(keys),
-        )
-    every = [(row["case"] in study.meta["lost"], row) for study in studies for row in study.rows()]
-    finished = by_case([row for is_lost, row in every if not is_lost], "A sweep")
-    lost = {row["case"]: row for is_lost, row in every if is_lost}
-    rows = lost | finished
-    names = dict.fromkeys(name for study in studies for name in study.columns if name not in FAILURE)
-    columns = {name: [rows[i].get(name) for i in sorted(rows)] for name in (*names, *FAILURE)}
-    meta = studies[0].meta | {"shard": None, "lost": sorted(lost.keys() - finished.keys())}
-    meta["interrupted"] = any(study.meta["interrupted"] for study in studies) and len(rows) < meta["count"]
-    return Study("sweep", columns, meta | {"message": _message(columns, meta, meta["count"])})
+    return Study("sweep", columns, meta | {"message": _message(columns, meta)})
 
 
 def evaluate(case, index, parameters, seed):
@@ -227,19 +167,19 @@ def _extrema(run, names):
 # --- where cases are computed
 
 
-def _in_turn(case, todo, seed):
+def _in_turn(case, cases, seed):
     """Rows (index, row, finished) computed in this process."""
     with _recorded_interrupts() as interrupts:
-        for i, parameters in todo:
+        for i, parameters in enumerate(cases):
             row = evaluate(case, i, parameters, seed)
             if interrupts:
                 raise KeyboardInterrupt  # which `simulate` inside the case caught: its row is that of half a run
             yield i, row, True
 
 
-def _on(executor, case, todo, seed):
+def _on(executor, case, cases, seed):
     """Rows (index, row, finished) as an executor finishes them; a case that it did not finish has its error."""
-    calls = {i: (case, i, parameters, seed) for i, parameters in todo}
+    calls = {i: (case, i, parameters, seed) for i, parameters in enumerate(cases)}
     for i, row, error in on_executor(executor, evaluate, calls):
         yield i, row if error is None else {"case": i} | lost(error), error is None
 
@@ -304,11 +244,6 @@ def name_of(case):
     return getattr(case, "__qualname__", type(case).__qualname__)
 
 
-def _module_of(case):
-    case = case.func if isinstance(case, functools.partial) else case
-    return getattr(case, "__module__", type(case).__module__)
-
-
 def _seed(case, seed):
     try:
         draws = "rng" in inspect.signature(case).parameters
@@ -327,18 +262,7 @@ def _seed(case, seed):
     )
 
 
-def _part(shard, count):
-    try:
-        i, n = (whole("shard", part) for part in shard)
-    except (TypeError, ValueError):
-        i = n = 0
-    if not 1 <= i <= n:
-        rule = "A shard (i, n) is part i of n parts, 1 <= i <= n."
-        raise SpecificationError(f"shard = {shard!r} was given.", rule, shard=shard)
-    return range(i - 1, count, n)
-
-
-def require_fitting(case, parameters, seed):
+def _require_fitting(case, parameters, seed):
     """Refuse parameters that the case's function does not have."""
     random = {} if seed is None else {"rng": None}
     try:
@@ -378,9 +302,9 @@ def _require_sendable(case, executor):
 # --- the table
 
 
-def _message(columns, meta, count):
+def _message(columns, meta):
     failed, lost = sum(error != "" for error in columns["error"]), len(meta["lost"])
-    parts = [f"{len(columns['case']) - failed} of {count} cases finished"]
+    parts = [f"{len(columns['case']) - failed} of {meta['count']} cases finished"]
     parts += [f"{failed - lost} failed"] if failed > lost else []
     parts += [f"{lost} not finished by the executor"] if lost else []
     parts += ["interrupted"] if meta["interrupted"] else []
