@@ -21,12 +21,13 @@ ERRORS = (1e-4, 1e-6, 1e-9)
 TEXT = """# Speed against accuracy, measured
 
 Each figure is `sv.tradeoff(model, start, t_span).plot()` for a scene of the gallery, made by
-`python benchmarks/work_precision.py`; `servoctl tradeoff NAME` measures one on your machine, and your own scene. A
-point is one setting of one method: the error of the whole motion (the largest deviation of a component of the state,
-relative to its size, at 402 instants that are the same for all methods, between their steps too) over the shortest of
-three calls after a warm-up. The reference is the Taylor method at 1e-15, or
-Newton's method at each instant where nothing is integrated; another method verifies it, and the grey band at the
-bottom is how far the two agree. Seconds depend on the machine and on what else it does; evaluations do not.
+`python benchmarks/work_precision.py`; `servoctl tradeoff NAME` measures one on your machine, and your own scene, and
+[levels of modelling](levels.md) are compared in the same way. A point is one setting of one method: the error of the
+whole motion (the largest deviation of a component of the state, relative to its size, at 402 instants that are the same
+for all methods, between their steps too) over the shortest of three calls after a warm-up. The reference is the Taylor
+method at 1e-15, or Newton's method at each instant where nothing is integrated; another method verifies it, and the
+grey band at the bottom is how far the two agree. Seconds depend on the machine and on what else it does; evaluations do
+not.
 
 Measured on {processor}, {cores} cores, {system}, compiler {compiler}, with other work on the machine;
 {versions}; {measured}.

@@ -83,12 +83,9 @@ from servoctl.study.cases import grid as grid
 from servoctl.study.cases import monte_carlo as monte_carlo
 from servoctl.study.close_many import Batch as Batch
 from servoctl.study.close_many import close_many as close_many
-from servoctl.study.levels import Levels as Levels
-from servoctl.study.levels import levels as levels
 from servoctl.study.load import load_study as load_study
 from servoctl.study.many import Motions as Motions
 from servoctl.study.many import simulate_many as simulate_many
-from servoctl.study.power_law import Prediction as Prediction
 from servoctl.study.stability_map import StabilityMap as StabilityMap
 from servoctl.study.stability_map import stability as stability
 from servoctl.study.sweep import sweep as sweep

@@ -1,4 +1,4 @@
-"""Levels of modelling: errors against closed forms, advice that holds on the motion, predictions against measurements."""
+"""Levels of modelling in one trade-off: errors against closed forms, advice that holds on the motion."""
 
 from functools import cache, partial
 
@@ -6,15 +6,12 @@ import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
-from scipy.integrate import quad
 
 import servoctl as sv
 from servoctl.errors import LimitExceeded, NameUnknown, SingularProgram, SpecificationError
 from servoctl.figures.work_precision import COLOURS
 from servoctl.gallery import gallery
-from servoctl.study.levels import ERRORS
-from servoctl.study.modelling import _signal_sizes
-from servoctl.study.power_law import power_law
+from servoctl.study.tradeoff import ERRORS
 
 # --- scenes, each with a parameter that its reference has more than its simple level
 
@@ -34,16 +31,6 @@ def lift(rope="rigid", smoothness=6):
         parameters=p,
     )
     return mechanism, sv.Program({"load": y - path}, by="actuators")
-
-
-def drive(tau=None):
-    """A mass on a line, under a force that follows its input at once or with a lag."""
-    p, q = sv.parameters(m=2.0), sv.coordinates("x")
-    (x,) = q
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
-    mechanism = sv.Mechanism(q, sv.particle(q, p.m, x), actuators={"force": x}, parameters=p)
-    machine = mechanism if tau is None else sv.plant(mechanism, lag={"force": tau})
-    return machine, sv.Program({"x": x - path}, by="actuators")
 
 
 def joint(kind="rigid"):
@@ -126,76 +113,31 @@ def derived(build, *kind):
     return sv.derive(*build(*kind))
 
 
-ROPES = {name: partial(derived, lift, name) for name in ("rigid", "elastic")}
+def ropes(k=2e5, smoothness=6, **options):
+    """The trade-off between an elastic rope, the reference, and a rigid one."""
+    models = {name: derived(lift, name).with_parameters(k=k) for name in ("elastic", "rigid")}
+    return sv.tradeoff(models, models["elastic"].start(), (0.0, 3.0), **options)
+
+
+def pendula(*others, start=None, span=(0.0, 4.0), reference="friction", **options):
+    """The trade-off between pendula on a cart."""
+    models = {name: PENDULA[name]() for name in (reference, *others)}
+    return sv.tradeoff(models, models[reference].start(**start or {}), span, **options)
+
+
 PENDULA = {
     "linear": partial(derived, cart, False, True), "plain": partial(derived, cart), "friction": partial(derived, cart, True),
 }  # fmt: skip
-SCENES = {  # levels, the simple one, reference, span, parameter, measured values, predicted values, error, options
-    "elastic rope": (ROPES, "rigid", "elastic", 3.0, "k", (1e5, 2e5, 4e5), (6e4, 7e5), "modelling", {}),
-    "elastic rope of a crane": (
-        {name: partial(derived, crane, name) for name in ("rigid", "elastic")}, "rigid", "elastic", 6.0,
-        "EA", (5e5, 1e6, 2e6), (3e5, 3.5e6), "modelling", {"start": lambda model: model.start(guess={"l": 4.0})},
-    ),
-    "lag": (
-        {"none": lambda: drive(), "lag": drive}, "none", "lag", 1.0,
-        "tau", (0.01, 0.02, 0.04), (0.006, 0.07), "in_loop", {"law": partial(sv.feedforward, rate=1000.0)},
-    ),
-    "elastic joint": (
-        {name: partial(derived, joint, name) for name in ("rigid", "elastic")}, "rigid", "elastic", 1.0,
-        "k", (1e3, 2e3, 4e3), (600.0, 7e3), "actuation", {},
-    ),
-    "friction": (PENDULA, "plain", "friction", 4.0, "d", (0.02, 0.05, 0.1), (0.03, 0.2), "modelling", {}),
-    "body": (
-        {name: partial(derived, arm, name) for name in ("point", "body")}, "point", "body", 1.0,
-        "J", (0.02, 0.05, 0.1), (0.03, 0.2), "actuation", {},
-    ),
-    "small angles": (
-        PENDULA, "linear", "plain", 4.0,
-        "distance", (0.4, 0.7, 1.0), (0.3, 1.5), "modelling", {},
-    ),
-}  # fmt: skip
-
-
-@pytest.fixture(scope="module", autouse=True)
-def timed_briefly():
-    """No test asserts a time: the fewest rounds will do."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("servoctl.study.modelling.ROUNDS_FOR", 0.0)
-        yield
+TOLERANCES = (1e-3, 1e-6, 1e-9)
 
 
 @pytest.fixture(scope="module")
-def pendula():
-    return sv.levels(PENDULA, (0.0, 4.0), reference="friction", law=partial(sv.feedforward, rate=500.0))
-
-
-@pytest.fixture(scope="module")
-def ropes():
-    return sv.levels(ROPES, (0.0, 3.0), reference="elastic", cases={"k": [1e5, 2e5, 4e5]})
+def three():
+    return pendula("plain", "linear", methods={"Taylor": TOLERANCES}, seconds=3.0)
 
 
 def instants(t1, count=2001):
     return np.linspace(0.0, t1, count)
-
-
-# --- errors
-
-
-def test_a_rigid_rope_errs_by_its_stretch(ropes):
-    """h = y + m (y'' + g)/k; the winch's force differs by M m y''''/k."""
-    t, m, M = instants(3.0), 100.0, 20.0
-    path = sv.simulate(*planned(derived(lift)), (0.0, 3.0), t_eval=t)
-    y, d2y, d4y = path["h"], path["d2h"], derivative(4, t)
-    for k in (1e5, 2e5, 4e5):
-        row = ropes.where(level="rigid", k=k).rows()[0]
-        stretch = m * (d2y + 9.81) / k
-        assert row["modelling"] == row["error"] == pytest.approx(stretch.max() / (y + stretch).max(), rel=1e-3)
-        force = M * (d2y + m * d4y / k) + m * (d2y + 9.81)
-        assert row["actuation"] == pytest.approx(np.abs(M * m * d4y / k).max() / force.max(), rel=1e-3)
-
-
-def planned(model):
-    return model, model.start()
 
 
 def derivative(order, t):
@@ -206,52 +148,51 @@ def derivative(order, t):
     return ca.Function("path", [q.t], [path])(t[None, :]).full()[0]
 
 
-def test_a_lag_errs_by_the_response_of_its_filter():
-    """Under u(t) = F(t) the machine has m x'' = F filtered, and its position is the filtered path."""
-    study = sv.levels(
-        {"none": lambda: drive(), "lag": drive}, (0.0, 1.0), reference="lag", cases={"tau": [0.02]},
-        law=partial(sv.feedforward, rate=2000.0),
-    )  # fmt: skip
-    model, start = planned(derived(drive))
-    path = sv.simulate(model, start, (0.0, 1.0), t_eval=instants(1.0, 4001))
-    t, x = path.t, path["x"]
+# --- errors
 
-    def filtered(until):
-        return quad(lambda s: np.exp(-(until - s) / 0.02) / 0.02 * np.interp(s, t, x), 0.0, until, limit=200)[0]
 
-    off = max(abs(filtered(until) - np.interp(until, t, x)) for until in np.linspace(0.4, 0.7, 31))
-    lost, own = (study.where(level=name)["in_loop"][0] for name in ("none", "lag"))
-    assert lost == pytest.approx(off, rel=1e-3) and own < 1e-6
-    assert np.all(study["error"] <= study.uncertainty), "the plans are the same"
+@pytest.mark.parametrize("k", [1e5, 2e5, 4e5])
+def test_a_rigid_rope_errs_by_its_stretch(k):
+    """h = y + m (y'' + g)/k; the winch's force differs by M m y''''/k."""
+    t, m, M = instants(3.0), 100.0, 20.0
+    y, d2y, d4y = (derivative(order, t) for order in (0, 2, 4))
+    rigid = ropes(k, outputs=["h"]).where(model="rigid").rows()[0]
+    stretch = m * (d2y + 9.81) / k
+    assert rigid["error"] == pytest.approx(stretch.max() / (y + stretch).max(), rel=1e-3)
+    force = M * (d2y + m * d4y / k) + m * (d2y + 9.81)
+    assert rigid["actuation"] == pytest.approx(np.abs(M * m * d4y / k).max() / force.max(), rel=1e-3)
+    assert rigid["integration"] < 1e-12, "it is an error of modelling alone"
 
 
 def test_the_same_machine_in_other_coordinates_has_no_error():
-    """Relative and redundant coordinates, with a material constraint: outputs of one are coordinates of the other."""
-    builds = {name: partial(gallery["overhead-crane"].build, coordinates=name) for name in ("relative", "redundant")}
-    study = sv.levels(builds, (0.0, 8.0), reference="relative", start=lambda model: model.start(guess={"l": 4.0}))
-    assert study.meta["outputs"] == ["x", "l", "tension", "X", "Z"] and study.meta["actuators"] == ["trolley", "hoist"]
-    assert np.all(study["modelling"] < 1e-11) and np.all(study["actuation"] < 1e-11)
+    """Relative and redundant coordinates, with a material constraint."""
+    models = {name: sv.derive(*gallery["overhead-crane"].build(coordinates=name)) for name in ("relative", "redundant")}
+    start = models["relative"].start(guess={"l": 4.0})
+    study = sv.tradeoff(models, start, (0.0, 8.0), {"algebraic": 0.1})
+    assert {"x", "l", "dx", "dl"} <= set(study.meta["outputs"])
+    assert np.all(study["error"] < 1e-11) and np.all(study["actuation"] < 1e-11)
+    outputs = sv.tradeoff(models, start, (0.0, 8.0), {"algebraic": 0.1}, outputs=["x", "l", "tension", "X", "Z"])
+    assert np.all(outputs["error"] < 1e-11)
 
 
-def test_modelling_and_integration_are_errors_of_their_own(pendula):
-    for level in ("linear", "plain"):
-        rows = pendula.where(level=level)
-        assert np.ptp(rows["modelling"]) == 0 and rows["modelling"][0] > 1e-2
-        assert rows["integration"][-1] < 1e-9 and rows["error"][-1] == pytest.approx(rows["modelling"][0], rel=1e-6)
-        assert np.all(np.abs(rows["error"] - rows["modelling"]) <= rows["integration"] + 1e-15)  # rounding
-    own = pendula.where(level="friction")
-    assert np.all(own["modelling"] == 0) and np.array_equal(own["error"], own["integration"])
+def test_errors_of_modelling_and_of_integration_are_told_apart(three):
+    for model in ("linear", "plain"):
+        rows = three.where(model=model)
+        assert rows["error"].min() > 1e-2 and rows["integration"][-1] < 1e-9
+        assert np.all(np.abs(rows["error"] - rows["error"][-1]) <= rows["integration"] + 1e-9)
+    own = three.where(model="friction")
+    assert np.array_equal(own["error"], own["integration"])
     assert own["integration"][0] > 1e3 * own["integration"][-1]
 
 
-def test_operations_do_not_depend_on_the_machine_and_order_the_levels(pendula, ropes):
-    for study, order in ((pendula, ("linear", "plain", "friction")), (ropes, ("rigid", "elastic"))):
-        counts = [set(study.where(level=level)["operations"]) for level in order]
+def test_operations_do_not_depend_on_the_machine_and_order_the_models(three):
+    for study, order in ((three, ("linear", "plain", "friction")), (ropes(methods={"algebraic": 0.1}), ("rigid", "elastic"))):
+        counts = [set(study.where(model=model)["operations"]) for model in order]
         assert all(len(count) == 1 for count in counts) and counts == sorted(counts, key=min)
-    assert np.all(np.isfinite(pendula["seconds"])) and np.all(pendula["evaluations"] > 0)
+    assert np.all(np.isfinite(three["seconds"])) and np.all(three["evaluations"] > 0)
 
 
-def test_a_stiff_level_is_measured_by_an_implicit_method_too():
+def test_a_stiff_model_is_measured_by_an_implicit_method_too():
     """A damped spring with a time constant of 0.5 ms: 2,000 of them in the span."""
     def coupled(stiff=True):
         q = sv.coordinates("x y")
@@ -262,300 +203,136 @@ def test_a_stiff_level_is_measured_by_an_implicit_method_too():
             forces={"x": pull if stiff else y - x, "y": -pull if stiff else x - y},
         )  # fmt: skip
         path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
-        return mechanism, sv.Program({"x": x - path}, by="actuators")
+        return sv.derive(mechanism, sv.Program({"x": x - path}, by="actuators"))
 
-    study = sv.levels({"stiff": coupled, "soft": partial(coupled, False)}, (0.0, 1.0), reference="stiff")
-    stiff = study.where(level="stiff")
-    assert list(dict.fromkeys(stiff["method"])) == ["Taylor", "RadauIIA"] and set(study["failure"]) == {""}
-    assert set(study.where(level="soft")["method"]) == {"Taylor"}
-    implicit = stiff.where(method="RadauIIA")
-    assert implicit["steps"].max() < stiff.where(method="Taylor")["steps"].min() / 10
-    assert np.all(implicit["integration"] < [1e-2, 1e-5, 1e-8])
+    models = {"stiff": coupled(), "soft": coupled(False)}
+    study = sv.tradeoff(models, models["stiff"].start(), (0.0, 1.0), seconds=3.0)
+    assert list(dict.fromkeys(study.where(model="soft")["method"])) == ["Taylor", "RadauIIA"]
+    stiff = study.where(model="stiff").take(np.flatnonzero(np.isfinite(study.where(model="stiff")["error"])))
+    implicit, series = stiff.where(method="RadauIIA", value=1e-5), stiff.where(method="Taylor", value=1e-5)
+    assert implicit["steps"][0] < series["steps"][0] / 10 and implicit["error"][0] < 1e-4
 
 
 def test_sizes_make_errors_absolute():
-    study = sv.levels(ROPES, (0.0, 3.0), reference="elastic", outputs={"h": 1e-3})
     d2y = derivative(2, instants(3.0))
-    assert study.where(level="rigid")["error"][0] == pytest.approx(1e3 * (100 * (d2y + 9.81) / 2e5).max(), rel=1e-3)
-    exact = sv.levels(ROPES, (0.0, 3.0), reference="elastic", outputs="load")
-    assert np.all(exact["error"] < 1e-12), "the program holds the load at every level"
+    rigid = ropes(outputs={"h": 1e-3}).where(model="rigid")
+    assert rigid["error"][0] == pytest.approx(1e3 * (100 * (d2y + 9.81) / 2e5).max(), rel=1e-3)
+    held = ropes(outputs="load", methods={"algebraic": 0.1})
+    assert np.all(held["error"] < 1e-12), "the program holds the load in every model"
 
 
-def test_levels_start_alike():
-    """Values held by name, in those levels that have them; what is free is near the start of the reference."""
-    study = sv.levels(
-        {name: PENDULA[name] for name in ("plain", "friction")}, (0.0, 1.0), reference="friction", start={"theta": 0.3},
-        cases={"d": [0.0, 0.05]},
-    )  # fmt: skip
-    assert np.all(study.where(d=0.0)["modelling"] < 1e-11), "without friction both are one motion"
-    assert np.all(study.where(d=0.05, level="plain")["modelling"] > 1e-4)
-    with refused(NameUnknown, name="thetta", match="theta"):
-        sv.levels({"plain": PENDULA["plain"]}, (0.0, 1.0), reference="plain", start={"thetta": 0.3})
+def test_models_start_alike():
+    """What the start of the reference holds is held where it exists; the rest is as near as possible to it."""
+    model = PENDULA["friction"]()
+    for d, alike in ((0.0, True), (0.05, False)):
+        models = {"friction": model.with_parameters(d=d), "plain": PENDULA["plain"]()}
+        start = models["friction"].start(theta=0.3)
+        plain = sv.tradeoff(models, start, (0.0, 1.0), {"Taylor": 1e-12}).where(model="plain")
+        assert plain["error"][0] < 1e-11 if alike else plain["error"][0] > 1e-4
 
 
 def test_coordinates_that_play_no_part_are_compared_on_demand():
-    def build():
-        q = sv.coordinates("x y")
-        x, y = q
-        S, path = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y), sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
-        return sv.Mechanism(q, S, potential=2 * y**2, actuators={"u": x}), sv.Program({"x": x - path}, by="actuators")
-
-    assert sv.levels({"a": build}, (0.0, 1.0), reference="a").meta["outputs"] == ["x"]
-    assert sv.levels({"a": build}, (0.0, 1.0), reference="a", outputs=["x", "y"]).meta["outputs"] == ["x", "y"]
+    q = sv.coordinates("x y")
+    x, y = q
+    S, path = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y), sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
+    mechanism = sv.Mechanism(q, S, potential=2 * y**2, actuators={"u": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - path}, by="actuators"))
+    assert "y" not in sv.tradeoff(model, model.start(), (0.0, 1.0)).meta["outputs"]
+    whole = model.including(["y"])
+    study = sv.tradeoff(whole, whole.start(y=0.1), (0.0, 1.0), {"Taylor": 1e-9}, "project", outputs=["x", "y"])
+    assert study.meta["outputs"] == ["x", "y"] and study["error"][0] < 1e-8
 
 
 def test_ideal_programs_compare_reactions():
     wheel = gallery["appell-hamel"]
-    start = {"dphi": 1.0, "dtheta": 2.0}
-    heavy = sv.derive(*wheel.build()).with_parameters(I_x=0.25)
-    study = sv.levels({"light": wheel.build, "heavy": heavy}, (0.0, 1.0), reference="heavy", start=start)
-    assert study.meta["actuators"] == [f"reaction_{name}" for name in ("x", "y", "z", "phi", "theta")]
-    light = study.where(level="light")
-    assert np.all(light["error"] > 1e-3) and np.all(light["actuation"] > 1e-3) and np.all(np.isnan(light["in_loop"]))
+    light = sv.derive(*wheel.build())
+    models = {"heavy": light.with_parameters(I_x=0.25), "light": light}
+    study = sv.tradeoff(models, models["heavy"].start(dphi=1.0, dtheta=2.0), (0.0, 1.0), {"Taylor": [1e-3, 1e-9]})
+    light = study.where(model="light")
+    assert np.all(light["error"] > 1e-3) and np.all(light["actuation"] > 1e-3)
+    assert study.where(model="heavy")["actuation"][-1] < 1e-8
 
 
-# --- what a level cannot do
+# --- what a model cannot do
 
 
-def test_what_a_level_cannot_do_is_a_row():
-    def lost():
-        q = sv.coordinates("h y")
-        h, y = q
-        path = sv.paths.rest_to_rest(q.t, 0.0, 2.0, duration=3.0, smoothness=6)
-        mechanism = sv.Mechanism(q, sv.particle(q, 1.0, h) + sv.particle(q, 1.0, y), actuators={"winch": h})
-        return mechanism, sv.Program({"load": y - path}, by="actuators")
-
-    study = sv.levels({"lost": lost, **ROPES, "rough": partial(lift, "elastic", 3)}, (0.0, 3.0), reference="elastic")
-    assert study["level"].tolist() == ["lost", "rigid", "elastic", "rough"]
-    assert [failure[:14] for failure in study["failure"]] == ["NotRealisable:", "", "", "SpecificationE"]
-    assert study.recommend(error=0.1).row["level"] in ROPES
+def test_what_no_row_reaches_names_the_nearest_model():
+    study = ropes(seconds=3.0)
+    assert study.recommend(error=0.1).row["model"] in ("rigid", "elastic")
     with refused(LimitExceeded, limit=1e-20) as caught:
         study.recommend(error=1e-20)
     assert "Nearest: elastic" in str(caught.value)
 
 
-def test_a_level_that_ends_early_is_a_row_and_a_reference_that_does_is_refused():
-    speed = gallery["constant-speed-horizontal"]
-    vertical = gallery["constant-speed"]
-    builds = {"horizontal": speed.build, "ideal": vertical.build}
-    start = dict(vertical.start)
-    study = sv.levels(builds, (0.0, 0.8), reference="ideal", start=start)
-    assert study.where(level="horizontal")["failure"][0].startswith("SingularProgram")
-    assert np.isnan(study.where(level="horizontal")["error"][0])
+def test_a_model_that_ends_early_is_a_row_and_a_reference_that_does_is_refused():
+    scenes = {"ideal": gallery["constant-speed"], "horizontal": gallery["constant-speed-horizontal"]}
+    models = {name: sv.derive(*scene.build()) for name, scene in scenes.items()}
+    held = dict(scenes["ideal"].start)
+    study = sv.tradeoff(models, models["ideal"].start(**held), (0.0, 0.8), {"Taylor": 1e-6})
+    assert study.where(model="horizontal")["failure"][0].startswith("SingularProgram")
+    assert np.isnan(study.where(model="horizontal")["error"][0])
     with pytest.raises(SingularProgram):
-        sv.levels(builds, (0.0, 0.8), reference="horizontal", start=start)
-
-
-def test_a_case_that_the_reference_cannot_do_is_a_row_for_each_level():
-    """In the second case the load has no mass; in the first one there would be nothing to compare with."""
-    study = sv.levels(ROPES, (0.0, 3.0), reference="elastic", cases={"m": [100.0, -1.0, 50.0]})
-    lost = [failure.startswith("the reference: SpecificationError") for failure in study["failure"]]
-    assert lost == [False, False, True, True, False, False]
-    with refused(SpecificationError):
-        sv.levels(ROPES, (0.0, 3.0), reference="elastic", cases={"m": [-1.0, 100.0]})
-
-
-def test_a_loop_that_cannot_be_closed_leaves_the_other_numbers():
-    study = sv.levels({"plain": PENDULA["plain"]}, (0.0, 1.0), reference="plain", law=partial(sv.feedforward, rate=0.7))
-    assert np.all(np.isfinite(study["error"])) and np.all(np.isnan(study["in_loop"]))
-    assert all(failure.startswith("in the loop: SpecificationError") for failure in study["failure"])
+        sv.tradeoff(dict(reversed(models.items())), models["horizontal"].start(**held), (0.0, 0.8))
 
 
 def test_inputs_are_refused_in_words():
-    span = (0.0, 3.0)
-    with refused(NameUnknown, name="elastik", match="elastic"):
-        sv.levels(ROPES, span, reference="elastik")
+    elastic, span = derived(lift, "elastic"), (0.0, 3.0)
+    start = elastic.start()
     with refused(NameUnknown, name="laod", match="load"):
-        sv.levels(ROPES, span, reference="elastic", outputs=["laod"])
-    with refused(NameUnknown, name="K", match="k"):
-        sv.levels(ROPES, span, reference="elastic", cases={"K": [1.0]})
-    with refused(SpecificationError, name="value"):
-        sv.levels(ROPES, span, reference="elastic", cases={"value": [1.0]})
-    with refused(SpecificationError, "lag", name="lag"):
-        sv.levels({"lag": partial(drive, 0.1)}, (0.0, 1.0), reference="lag")
-    with refused(SpecificationError, name="one", type="int"):
-        sv.levels({"one": 1}, span, reference="one")
-    with refused(SpecificationError, type="str"):
-        sv.levels(ROPES, span, reference="elastic", law="lqr")
-    with refused(SpecificationError, levels=["rope", "cart"]):
-        sv.levels({"rope": lift, "cart": drive}, (0.0, 1.0), reference="rope")
+        sv.tradeoff(elastic, start, span, outputs=["laod"])
+    with refused(SpecificationError, name="model 'one'", type="int"):
+        sv.tradeoff({"elastic": elastic, "one": 1}, start, span)
+    for outputs in ([], {}, 3):
+        with refused(SpecificationError):
+            sv.tradeoff(elastic, start, span, outputs=outputs)
+    with refused(SpecificationError, models=0):
+        sv.tradeoff({}, start, span)
+    with refused(SpecificationError, models=["rope", "joint"]):
+        sv.tradeoff({"rope": elastic, "joint": derived(joint)}, start, (0.0, 1.0))
 
 
 # --- advice
 
 
-def test_a_recommendation_holds_at_all_instants(pendula):
+def test_a_recommendation_holds_at_all_instants(three):
     """The recommended motion is compared with the reference's where nothing was measured."""
     t = np.sort(np.random.default_rng(5).uniform(0.0, 4.0, 3000))
-    model, start = planned(PENDULA["friction"]())
-    exact = sv.simulate(model, start, (0.0, 4.0), sv.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=t)
+    model = PENDULA["friction"]()
+    exact = sv.simulate(model, model.start(), (0.0, 4.0), sv.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=t)
     for error in (0.5, 0.2, 1e-4, 1e-6, 1e-9):
-        best = pendula.recommend(error=error)
-        run = sv.simulate(*planned(PENDULA[best.row["level"]]()), (0.0, 4.0), t_eval=t, **best)
+        best = three.recommend(error=error)
+        model = PENDULA[best.row["model"]]()
+        run = sv.simulate(model, model.start(), (0.0, 4.0), t_eval=t, **best)
         off = max(np.abs(run[name] - exact[name]).max() / np.abs(exact[name]).max() for name in ("x", "theta"))
         assert off <= error and off <= 1.02 * best.row["error"]
 
 
-def test_the_front_and_the_advice_follow_from_the_rows(pendula):
+def test_the_front_and_the_advice_follow_from_the_rows(three):
     for of in ERRORS:
-        front = pendula.pareto(of=of)
+        front = three.pareto(of=of)
         assert np.all(np.diff(front["seconds"]) > 0) and np.all(np.diff(front[of]) < 0) or len(front) == 1
-    fast = pendula.recommend(seconds=1.0)
-    assert fast.row["level"] == "friction" and fast.row["error"] == pendula["error"].min()
-    best = pendula.recommend(error=1e-4, of="in_loop")
-    assert best.row["level"] == "friction" and best.row["in_loop"] <= 1e-4
-    for options in ({}, {"error": 1.0, "seconds": 1.0}, {"error": -1.0}):
-        with refused(SpecificationError):
-            pendula.recommend(**options)
-    with refused(NameUnknown, name="modeling", match="modelling"):
-        pendula.recommend(error=1.0, of="modeling")
-
-
-def test_advice_for_other_parameters_uses_the_upper_end_of_the_prediction(ropes):
-    measured = ropes.where(level="rigid")["error"]
-    assert ropes.recommend(error=1.01 * measured.max()).row["level"] in ROPES
-    assert ropes.recommend(error=0.99 * measured.max()).row["level"] == "elastic", "it holds for all cases"
-    known = ropes.recommend(error=1.01 * measured[2], parameters={"k": 4e5})
-    assert known.row["k"] == 4e5
-    high = ropes.predict("rigid", {"k": 3e5}, of="error").high
-    assert ropes.recommend(error=0.99 * high, parameters={"k": 3e5}).row["level"] == "elastic"
-    with refused(NameUnknown, name="K", match="k"):
-        ropes.recommend(error=0.1, parameters={"K": 3e5})
-
-
-# --- predictions
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_a_prediction_is_within_a_factor_of_two_of_what_is_measured(name):
-    builds, level, reference, end, parameter, values, others, of, options = SCENES[name]
-    builds = {key: builds[key] for key in (level, reference)}
-    cases = {parameter: [*values, *others]}
-    every = sv.levels(builds, (0.0, end), reference=reference, cases=cases, **options)
-    study = every.take([i for i, case in enumerate(every["case"]) if case < len(values)])
-    for value in others:
-        measured = every.where(level=level).where(**{parameter: value})[of][-1]
-        found = study.predict(level, {parameter: value}, of=of)
-        assert found.conclusive and found.low <= measured <= found.high, str(found)
-        assert 0.5 < found.value / measured < 2.0
-        assert abs(abs(found.exponents[parameter]) - (2.0 if parameter == "distance" else 1.0)) < 0.05
-
-
-def test_two_parameters_have_a_law_each():
-    cases = sv.grid(k=[1e5, 3e5], m=[80.0, 120.0])
-    study = sv.levels(ROPES, (0.0, 3.0), reference="elastic", cases=cases)
-    found = study.predict("rigid", {"k": 2e5, "m": 100.0})
-    d2y = derivative(2, instants(3.0))
-    y = derivative(0, instants(3.0))
-    stretch = 100.0 * (d2y + 9.81) / 2e5
-    assert found.conclusive and found.value == pytest.approx(stretch.max() / (y + stretch).max(), rel=0.02)
-    assert found.exponents["k"] == pytest.approx(-1.0, abs=0.02) and found.exponents["m"] == pytest.approx(1.0, abs=0.02)
-
-
-def test_a_reference_has_no_error_of_modelling(ropes):
-    inside, outside = (ropes.predict("elastic", {"k": k}) for k in (2e5, 1e7))
-    assert inside.conclusive and inside.value == 0.0 and inside.high == ropes.uncertainty
-    assert not outside.conclusive and outside.high == np.inf
-
-
-def test_vibrations_have_no_law():
-    """The plan of a rigid rope excites a soft one: how much depends on the path's duration in periods."""
-    cases = {"k": [600.0, 1000.0, 1800.0]}
-    law = partial(sv.feedforward, rate=200.0)
-    study = sv.levels(ROPES, (0.0, 3.0), reference="elastic", cases=cases, law=law)
-    found = study.predict("rigid", {"k": 1400.0}, of="in_loop")
-    assert not found.conclusive and "courses in time" in found.message
-    assert study["in_loop_like"].min() < 0.9 < 0.98 < study.where(level="rigid")["modelling_like"].min()
-
-
-@pytest.mark.parametrize("cases, errors, at, likeness", [
-    ([1.0, 2.0], [1.0, 2.0], 1.5, 1.0),  # no case left to check the law
-    ([1.0, 2.0, 4.0], [1.0, 2.0, 4.0], -1.0, 1.0),
-    ([1.0, 1.0, 1.0], [1.0, 1.0, 1.0], 1.0, 1.0),
-    ([1.0, 2.0, 4.0], [1e-12, 2.0, 4.0], 3.0, 1.0),  # one below the floor
-    ([1.0, 2.0, 4.0], [1.0, 2.0, 4.0], 3.0, -0.99),  # an error that changed its sign
-    ([1.0, 2.0, 4.0], [1.0, 0.1, 1.0], 3.0, 1.0),  # no power law
-    ([1.0, 2.0, 4.0], [1.0, 2.0, 4.0], 17.0, 1.0),  # too far
-])  # fmt: skip
-def test_what_the_cases_do_not_show_is_inconclusive(cases, errors, at, likeness):
-    found = power_law(np.array(cases)[:, None], np.array(errors), {"k": at}, 1e-9, likeness)
-    assert not found.conclusive and found.message and "inconclusive" in str(found)
-    assert not found.low > 0 or found.high > 2 * found.value
-
-
-@pytest.mark.parametrize("law", [
-    lambda a, s: a**s, lambda a, s: 1 + s**2 * a, lambda a, s: a / (1 + s**2 * a), lambda a, s: a**2 + s**2,
-])  # fmt: skip
-def test_conclusive_predictions_of_smooth_laws_are_within_a_factor_of_two(law):
-    rng, conclusive = np.random.default_rng(7), 0
-    for _ in range(300):
-        s, values, at = rng.uniform(-3, 3), np.array([0.5, 1.0, 2.0]), np.exp(rng.uniform(-2.0, 2.0))
-        found = power_law(values[:, None], law(values, s), {"a": at}, 1e-15)
-        conclusive += found.conclusive
-        assert found.low <= law(at, s) * (1 + 1e-9) and law(at, s) <= found.high * (1 + 1e-9)
-        assert not found.conclusive or 0.5 < found.value / law(at, s) < 2.0
-    assert conclusive > 10
-
-
-@pytest.mark.parametrize("curvature, at, likeness, conclusive", [
-    (0.08, 1.0, 1.0, True), (0.095, 1.0, 1.0, False),  # each case differs by 2 c from what the others predict
-    (0.0, 3.9, 1.0, True), (0.0, 4.1, 1.0, False), (0.0, 0.26, 1.0, True), (0.0, 0.24, 1.0, False),
-    (0.0, 1.0, 0.985, True), (0.0, 1.0, 0.975, False),
-])  # fmt: skip
-def test_a_prediction_is_conclusive_within_bounds(curvature, at, likeness, conclusive):
-    values = np.array([0.5, 1.0, 2.0])
-    errors = np.exp(curvature * np.array([1.0, 0.0, 1.0]))
-    found = power_law(values[:, None], errors, {"k": at}, 1e-15, likeness)
-    assert found.conclusive == conclusive
-
-
-def test_the_size_of_a_signal_that_is_rounding_is_one():
-    run = {"x": np.array([0.0, 2.0]), "side": np.array([1e-12, -1e-13]), "small": np.array([1e-8, 0.0]), "y": np.zeros(2)}
-    sizes = _signal_sizes(run, ("x", "side", "small", "y"), ["x", "y"])
-    assert sizes == {"x": 2.0, "side": 1.0, "small": 1e-8, "y": 2e-3}
-
-
-def test_a_prediction_needs_all_parameters_of_the_cases(ropes, pendula):
-    with refused(SpecificationError, missing=["k"]):
-        ropes.predict("rigid", {})
-    with refused(NameUnknown, name="rigd", match="rigid"):
-        ropes.predict("rigd", {"k": 1e5})
-    with refused(NameUnknown, name="d"):
-        pendula.predict("plain", {"d": 1.0})
-    named = sv.levels({"joint": joint}, (0.0, 1.0), reference="joint", cases={"kind": ["rigid", "elastic"]})
-    with refused(SpecificationError, name="kind"):
-        named.predict("joint", {"kind": 1.0})
+    fast = three.recommend(seconds=1.0)
+    assert fast.row["model"] == "friction" and fast.row["error"] == three["error"].min()
+    best = three.recommend(error=1e-4, of="actuation")
+    assert best.row["model"] == "friction" and best.row["actuation"] <= 1e-4
+    with refused(NameUnknown, name="aktuation", match="actuation"):
+        three.recommend(error=1.0, of="aktuation")
 
 
 # --- the table
 
 
-@pytest.mark.parametrize("calls, rows", [(1, 0), (4, 2)])
-def test_an_interrupted_study_has_the_cases_that_were_finished(calls, rows):
-    seen = []
-
-    def start(model):
-        seen.append(model)
-        if len(seen) == calls:
-            raise KeyboardInterrupt
-        return model.start()
-
-    study = sv.levels(ROPES, (0.0, 3.0), reference="elastic", cases={"k": [1e5, 2e5]}, start=start)
-    assert study.meta["message"] == "interrupted" and len(study) == rows
-    assert "interrupted" in repr(study) and len(repr(study).splitlines()) <= 12
-
-
-def test_a_study_of_levels_is_saved_printed_and_drawn(pendula, ropes, tmp_path):
-    for study in (pendula, ropes):
-        again = sv.load_study(study.save(tmp_path / "levels"))
-        assert type(again) is sv.Levels and repr(again) == repr(study)
-        assert "0x" not in study.meta["law"]
-        lines = repr(study).splitlines()
-        assert len(lines) <= 12 and max(map(len, lines)) <= 120
-    axes = pendula.plot(title="pendula")
-    filled = {line.get_label() for line in axes.get_lines() if line.get_color() in COLOURS}
-    assert set(pendula.pareto()["level"]) <= filled
-    labels = {text.get_text() for text in axes.get_legend().get_texts()}
-    assert set(PENDULA) <= labels
+def test_a_study_of_models_is_saved_printed_and_drawn(three, tmp_path):
+    again = sv.load_study(three.save(tmp_path / "models"))
+    assert type(again) is sv.TradeOff and repr(again) == repr(three)
+    lines = repr(three).splitlines()
+    assert len(lines) <= 12 and max(map(len, lines)) <= 120 and lines[4].split()[0] == "model"
+    axes = three.plot(title="pendula")
+    legend = axes.get_legend()
+    labels = {key.get_text(): line.get_color() for key, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
+    best = set(three.pareto()["model"])
+    assert {name for name, colour in labels.items() if colour in COLOURS} == best
+    assert all(any(name in label for label in labels) for name in PENDULA)
+    assert "actuation" in three.plot(of="actuation").get_ylabel()
     with refused(NameUnknown, name="price"):
-        pendula.plot(cost="price")
+        three.plot(cost="price")

@@ -75,7 +75,7 @@ def test_what_a_study_is_asked_for(scene):
         refused_study = {"methods": ["RK4"], "drift": [None]} | options
         with refused(sv.SpecificationError, "methods", "drift"):
             sv.tradeoff(*scene, SPAN, **refused_study)
-    study = sv.tradeoff(*scene, SPAN, "RK4", sv.Project(2), settings={"step": 0.1}, seconds=20.0)
+    study = sv.tradeoff(*scene, SPAN, {"RK4": 0.1}, sv.Project(2), seconds=20.0)
     assert study["drift"].tolist() == ["project 2"]
     for options in ({"error": 0}, {"error": "a"}, {"seconds": -1.0}, {"error": np.nan}):
         stopped(next(iter(options)), lambda options=options: study.recommend(**options))
@@ -94,7 +94,7 @@ def test_ctrl_c_ends_a_study_and_keeps_its_rows(scene, monkeypatch):
         return real(*given, **options)
 
     monkeypatch.setattr(module, "simulated", interrupted)
-    study = sv.tradeoff(*scene, SPAN, ["RK4", "RK8"], [None], settings={"step": [0.1, 0.05, 0.02]}, seconds=20.0)
+    study = sv.tradeoff(*scene, SPAN, dict.fromkeys(("RK4", "RK8"), [0.1, 0.05, 0.02]), [None], seconds=20.0)
     assert study.rows()[0]["method"] == "RK4" and study["value"].tolist() == [0.1, 0.05]
     assert np.all(np.isfinite(study["error"])) and study.meta["message"] == "interrupted"
     assert "interrupted" in repr(study).splitlines()[0]
@@ -161,7 +161,7 @@ def test_tolerances_that_scipy_would_replace_are_refused(scene):
         with refused(sv.SpecificationError, "rtol=1e-15", "2.22e-14"):
             sv.simulate(*scene, SPAN, method=as_method(method, rtol=1e-15))
     assert sv.simulate(*scene, SPAN, method=sv.Taylor(rtol=1e-15)).success
-    stopped("at most 1", lambda: sv.tradeoff(*scene, SPAN, ["DOP853"], [None], settings={"rtol": [10.0, 1e-6]}))
+    stopped("at most 1", lambda: sv.tradeoff(*scene, SPAN, {"DOP853": [10.0, 1e-6]}, [None]))
 
 
 def test_studies_refuse_a_start_off_the_constraints(scene):

@@ -17,12 +17,13 @@ from servoctl.methods.choice import as_method
 from servoctl.shell.main import main
 from servoctl.study.load import load_study
 from servoctl.study.table import Study
+from servoctl.study.tradeoff import TOLERANCES as DEFAULTS
 from servoctl.study.tradeoff import TradeOff
 
 SPAN = (0.0, 1.0)
-METHODS = ("Taylor", "DOP853", "RK4", "LSODA")
-DRIFTS = (None, "project", 0.05)
 TOLERANCES, STEPS = (1e-3, 1e-6, 1e-9), (0.1, 0.025, 0.005)
+METHODS = {"Taylor": TOLERANCES, "DOP853": TOLERANCES, "RK4": STEPS, "LSODA": TOLERANCES}
+DRIFTS = (None, "project", 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +33,19 @@ def scene(wheel):
 
 @pytest.fixture(scope="module")
 def study(scene):
-    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS, settings={"rtol": TOLERANCES, "step": STEPS}, seconds=20.0)
+    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS, seconds=20.0)
 
 
 def synthetic(errors, seconds, uncertainty=1e-12, **changes):
     n = len(errors)
     columns = {name: [np.nan] * n for name in TradeOff.COLUMNS}
     columns |= {"method": ["Taylor"] * n, "drift": ["project"] * n, "setting": ["rtol"] * n, "failure": [""] * n}
+    columns |= {"model": [""] * n}
     columns |= {"error": errors, "seconds": seconds, "value": [10.0**-k for k in range(n)], **changes}
     reference = {"method": "a", "verified by": "b", "error": uncertainty, "actuation": 0.0}
     machine = {"processor": "p", "cores": 1, "compiler": "cc"}
-    return TradeOff("tradeoff", columns, {"t_span": [0.0, 1.0], "reference": reference, "machine": machine})
+    facts = {"t_span": [0.0, 1.0], "models": [""], "reference": reference, "machine": machine}
+    return TradeOff("tradeoff", columns, facts)
 
 
 # --- rows
@@ -83,7 +86,7 @@ def instants():
 
 def test_errors_between_the_steps_count(scene):
     """At its six steps RK8 has 2e-7; between them Hermite's interpolation leaves a thousand times more."""
-    study = sv.tradeoff(*scene, (0.0, 2.0), ["RK8", "Taylor"], ["project"], settings={"step": [0.4, 0.1, 0.02]})
+    study = sv.tradeoff(*scene, (0.0, 2.0), {"RK8": [0.4, 0.1, 0.02], "Taylor": DEFAULTS}, ["project"])
     coarse, fine = study.where(method="RK8", value=0.4), study.where(method="RK8", value=0.02)
     assert coarse["error"][0] > 1e-5 and fine["error"][0] < 1e-9
     for error in (1e-4, 1e-6, 1e-8):
@@ -122,9 +125,7 @@ def test_the_machine_is_recorded(study):
 
 def test_slow_candidates_are_skipped_and_say_so(scene, monkeypatch):
     monkeypatch.setattr("servoctl.study.tradeoff.FEW", 0)
-    slow = sv.tradeoff(
-        *scene, SPAN, ["RK4", "DOP853"], [None], settings={"rtol": TOLERANCES, "step": STEPS}, seconds=1e-9
-    )
+    slow = sv.tradeoff(*scene, SPAN, {"RK4": STEPS, "DOP853": TOLERANCES}, [None], seconds=1e-9)
     assert len(slow) == 6
     fixed, adaptive = slow.where(method="RK4").rows(), slow.where(method="DOP853").rows()
     assert fixed[0]["failure"] == "" and all(r["failure"].startswith("skipped: step = 0.1 took") for r in fixed[1:])
@@ -133,7 +134,7 @@ def test_slow_candidates_are_skipped_and_say_so(scene, monkeypatch):
 
 
 def test_what_gets_lost_in_its_first_steps_skips_no_finer_setting(scene):
-    lost = sv.tradeoff(*scene, SPAN, "DOP853", [None], settings={"rtol": TOLERANCES}, seconds=1e-9)
+    lost = sv.tradeoff(*scene, SPAN, {"DOP853": TOLERANCES}, [None], seconds=1e-9)
     assert len(lost) == len(TOLERANCES) and all("ended at t =" in failure for failure in lost["failure"])
 
 
@@ -144,9 +145,8 @@ def test_a_program_without_free_values_is_solved(gallery_model):
         model,
         start,
         (0.0, 8.0),
-        ["algebraic", "Taylor", "RK4"],
+        {"algebraic": [0.1], "Taylor": [1e-3, 1e-6], "RK4": 0.1},
         [None, "project"],
-        settings={"rtol": [1e-3, 1e-6], "step": [0.1]},
     )
     assert crane.meta["reference"]["method"] == "algebraic" and crane.uncertainty < 1e-12
     solved = crane.where(method="algebraic")
@@ -199,7 +199,7 @@ def test_the_fastest_within_an_error_and_the_best_within_a_time():
 
 def test_a_recommended_time_constant_is_the_measured_one(scene):
     constant = 1 / 7
-    study = sv.tradeoff(*scene, SPAN, "RK4", [constant], settings={"step": [0.01]}, seconds=20.0)
+    study = sv.tradeoff(*scene, SPAN, {"RK4": [0.01]}, [constant], seconds=20.0)
     assert study.recommend(error=1.0)["drift"] == constant
 
 
@@ -272,10 +272,10 @@ def test_the_plot_draws_every_number(cost, study):
     "given, error, fact",
     [
         ({"methods": ["RK3"]}, NameUnknown, "No method is named 'RK3'"),
-        ({"settings": {"rtol": [1e-3, -1.0]}}, SpecificationError, "rtol=[0.001, -1.0] was given"),
-        ({"settings": {"order": [8]}}, NameUnknown, "No setting is named 'order'"),
-        ({"settings": 1e-3}, SpecificationError, "given by name"),
-        ({"settings": {"step": "fine"}}, SpecificationError, "step='fine' was given"),
+        ({"methods": {"DOP853": [1e-3, -1.0]}}, SpecificationError, "rtol of DOP853=[0.001, -1.0] was given"),
+        ({"methods": {"order": [8]}}, NameUnknown, "No method is named 'order'"),
+        ({"methods": {"RK4": "fine"}}, SpecificationError, "step of RK4='fine' was given"),
+        ({"methods": {"RK4": []}}, SpecificationError, "step of RK4=[] was given"),
         ({"seconds": 0.0}, SpecificationError, "seconds = 0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),
         ({"drift": [sv.Poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),

@@ -1,11 +1,10 @@
 """Studies from files."""
 
 from servoctl import archive
-from servoctl.study.levels import Levels
 from servoctl.study.table import Study
 from servoctl.study.tradeoff import TradeOff
 
-KINDS = {"tradeoff": TradeOff, "levels": Levels}  # all others are of class Study
+KINDS = {"tradeoff": TradeOff}  # all others are of class Study
 
 
 def load_study(path) -> Study:
@@ -18,7 +17,7 @@ def load_study(path) -> Study:
     Returns
     -------
     Study
-        A `TradeOff` or `Levels` if that is what was saved.
+        A `TradeOff` if that is what was saved.
 
     Raises
     ------

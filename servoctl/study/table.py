@@ -23,14 +23,14 @@ SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 @frozen(eq=False)
 class Study(Shown):
-    """A table of results; made by `tradeoff`, `levels`, `stability`, `sweep` or `load_study`.
+    """A table of results; made by `tradeoff`, `sweep` or `load_study`.
 
     `study["seconds"]` is a column, `study.rows()` a list of dicts, `len(study)` the number of rows.
 
     Attributes
     ----------
     kind : str
-        "tradeoff", "levels" or "sweep".
+        "tradeoff", "sweep", "many" or "batch".
     columns : dict of str to (N,) array
         Numbers or texts by name. A missing number is NaN, a missing text is empty.
     meta : dict

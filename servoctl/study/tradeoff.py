@@ -1,7 +1,5 @@
-"""The trade-off: measured errors and costs of methods, settings and treatments of drift on one motion."""
+"""The trade-off: measured errors and costs of models, methods, settings and treatments of drift on one motion."""
 
-import functools
-import itertools
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,10 +10,8 @@ from servoctl.checks import as_span, is_number, mapping, named, positive, positi
 from servoctl.control.reference import resampled
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.markup import Shown
-from servoctl.methods.accuracy import motion_error, relative_error
 from servoctl.methods.choice import (
     METHODS,
-    Adaptive,
     Algebraic,
     Poles,
     Project,
@@ -28,27 +24,26 @@ from servoctl.methods.motion import DEFAULT_SAMPLES
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.progress import progress_bar
-from servoctl.simulation import consistent_state, simulated
+from servoctl.simulation import as_state, simulated
+from servoctl.study.converged import Comparison, Converged, Deadline, whole_run
 from servoctl.study.table import SHOWN, Study, machine, table
 
 MEASURED = tuple(name for name in METHODS if name != "bounded")  # which solves another problem
+OF_MODELS = ("Taylor", "RadauIIA")  # default methods where models are compared: the second for stiff ones
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # steps of a fixed length in the span
-INSTANTS = 51  # samples of adaptive methods while they are timed
-COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, and where in its interval each lies
-DENSE = 1001  # instants of the reference over which its power is integrated
 TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take this part of `seconds` together
 FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
 TIME_CONSTANT = 50  # default time constants of the poles in the span
 DRIFTS = ("none", "project")  # words of the column drift; others are time constants of poles
-CHECKS = (Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14))  # of the reference, in this order
 COSTS = ("seconds", "evaluations", "steps")
+ERRORS = ("error", "actuation")
 
 
 class Recommendation(dict):
     """Arguments of `simulate`, with the `row` that was measured with them; made by `TradeOff.recommend`.
 
-    `sv.simulate(model, x0, t_span, **study.recommend(error=1e-6))`
+    `sv.simulate(model, start, t_span, **study.recommend(error=1e-6))`
     """
 
     def __init__(self, options, row):
@@ -56,17 +51,7 @@ class Recommendation(dict):
         self.row = row
 
 
-def unbeaten(cost, error):
-    """Indices of the entries that no other one beats in both cost (N,) and error (N,), from cheap to accurate."""
-    front, best = [], np.inf
-    for i in np.lexsort((error, cost)):
-        if error[i] < best:
-            front.append(i)
-            best = error[i]
-    return np.array(front, dtype=int)
-
-
-def bound(error, seconds):
+def _wanted(error, seconds):
     """What bounds a recommendation, "error" or "seconds", and its value; exactly one of the two is a number."""
     if (error is None) == (seconds is None):
         raise SpecificationError(
@@ -84,31 +69,34 @@ def bound(error, seconds):
 
 
 class TradeOff(Study):
-    """Errors and costs of methods, settings and treatments of drift on one motion; made by `tradeoff`.
+    """Errors and costs of models, methods, settings and treatments of drift on one motion; made by `tradeoff`.
 
-    Columns: method; drift ("none", "project", or the time constant of the poles in s); setting ("rtol" or
-    "step") and its value; error of the motion: the largest deviation from the reference over the components of the
-    state, each relative to its largest magnitude (at least 1e-3 of the largest of its level), and over 402 instants
-    that are the same for all methods: dense output counts, and Hermite interpolation between the steps of fixed-step
-    methods; actuation: the same for the required forces and moments; residual: the largest of any constraint at any
-    level at these instants, in its unit; energy: energy gained less the work done along the reference, relative to
-    the largest energy; power: dE/dt less the power of all forces, relative (NaN where it does not apply); evaluations
-    of the right-hand side, or of the series, or Newton steps; steps; seconds: the shortest call after a warm-up, with
-    51 samples for adaptive methods (more samples take longer), and one at each instant or step for the others;
-    resolved: whether the error exceeds the uncertainty of the reference; failure: why there are no numbers.
+    Columns: model (empty if there is one); method; drift ("none", "project", or the time constant of the poles in s);
+    setting ("rtol" or "step") and its value; error of the motion: the largest deviation from the reference, which is
+    the converged motion of the first model, over the compared signals, each relative to its largest magnitude (a
+    component of the state to at least 1e-3 of the largest of its level), and over 402 instants that are the same for
+    all methods: dense output counts, and Hermite interpolation between the steps of fixed-step methods; integration:
+    the same from the converged motion of the row's own model, so that what an error has beyond it is an error of
+    modelling; actuation: the error of the required forces and moments; residual: the largest of any constraint at any
+    level at these instants, in its unit; energy: energy gained less the work done along the converged motion, relative
+    to the largest energy; power: dE/dt less the power of all forces, relative (NaN where it does not apply); operations
+    of one evaluation of the rates, or of Newton's step; evaluations of the right-hand side, or of the series, or Newton
+    steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive methods (more samples take
+    longer), and one at each instant or step for the others; resolved: whether the error of integration exceeds the
+    uncertainty of the converged motions; failure: why there are no numbers.
     """
 
     COLUMNS = (
-        *("method", "drift", "setting", "value", "error", "actuation", "residual", "energy", "power"),
-        *("evaluations", "steps", "seconds", "resolved", "failure"),
+        *("model", "method", "drift", "setting", "value", "error", "integration", "actuation", "residual", "energy"),
+        *("power", "operations", "evaluations", "steps", "seconds", "resolved", "failure"),
     )
 
     @property
     def uncertainty(self) -> float:
-        """Relative difference between the reference and the method that verified it."""
+        """Relative difference between a converged motion and the method that verified it, the largest of all models."""
         return self.meta["reference"]["error"]
 
-    def pareto(self, cost: str = "seconds") -> "TradeOff":
+    def pareto(self, cost: str = "seconds", of: str = "error") -> "TradeOff":
         """The rows that no other row beats in both error and cost, from cheap to accurate.
 
         Errors below the uncertainty of the reference count as equal to it.
@@ -116,15 +104,20 @@ class TradeOff(Study):
         Parameters
         ----------
         cost : {"seconds", "evaluations", "steps"}
+        of : {"error", "actuation"}
 
         Returns
         -------
         TradeOff
         """
-        good = self._good()
-        return self.take(good[unbeaten(self.column(as_cost(cost))[good], self._errors()[good])])
+        cost, error = self[named(cost, COSTS, "cost")], self._errors(of)
+        rows = np.lexsort((error, cost))
+        rows = rows[np.isfinite(error[rows]) & np.isfinite(cost[rows])]
+        return self.take(rows[error[rows] < np.minimum.accumulate(np.append(np.inf, error[rows]))[:-1]])
 
-    def recommend(self, *, error: float | None = None, seconds: float | None = None) -> Recommendation:
+    def recommend(
+        self, *, error: float | None = None, seconds: float | None = None, of: str = "error"
+    ) -> Recommendation:
         """Arguments of `simulate`: the fastest within an error, or the most accurate within a time.
 
         Parameters
@@ -133,11 +126,13 @@ class TradeOff(Study):
             Largest error of the motion, relative.
         seconds : float, optional
             Longest time of a call [s], on the machine that measured.
+        of : {"error", "actuation"}
+            Which error.
 
         Returns
         -------
         Recommendation
-            A dict of arguments; `.row` is the measured row.
+            A dict of arguments; `.row` is the measured row, `.row["model"]` the model.
 
         Raises
         ------
@@ -146,40 +141,46 @@ class TradeOff(Study):
         LimitExceeded
             If no row reaches it; the message has the nearest one.
         """
-        wanted, limit = bound(error, seconds)
-        front = self.pareto()
-        reached = front._errors() if wanted == "error" else front["seconds"]
+        wanted, limit = _wanted(error, seconds)
+        front = self.pareto(of=of)
+        reached = front._errors(of) if wanted == "error" else front["seconds"]
         within = np.flatnonzero(reached <= limit)
         if not len(within):
-            raise self._out_of_reach(wanted, limit, front)
+            raise self._out_of_reach(wanted, limit, front, of)
         row = front.rows()[within[0] if wanted == "error" else within[-1]]
         return Recommendation(arguments_of(row), row)
 
-    def _out_of_reach(self, wanted, limit, front):
+    def _errors(self, of):
+        """Errors of all rows, (N,), at least the uncertainty of the reference."""
+        return np.maximum(self[named(of, ERRORS, "error")], self.meta["reference"][of])
+
+    def _out_of_reach(self, wanted, limit, front, of):
         nearest = ""
         if len(front):
             row = front.rows()[-1 if wanted == "error" else 0]
-            best = max(row["error"], self.uncertainty)
-            nearest = f"{row['method']}, drift {row['drift']}, {row['setting']} {row['value']:g}: "
-            nearest += f"error {best:.2g} in {row['seconds']:.2g} s"
+            best = max(row[of], self.meta["reference"][of])
+            nearest = f"{row['model']}, " if row["model"] else ""
+            nearest += f"{row['method']}, drift {row['drift']}, {row['setting']} {row['value']:g}: "
+            nearest += f"{of} {best:.2g} in {row['seconds']:.2g} s"
         reason = "no measured setting reaches it" if len(front) else "every run failed, see the column failure"
         return LimitExceeded(
             f"{wanted}={limit:g} was given, and {reason}.",
-            f"The reference itself has the uncertainty {self.uncertainty:.1g}." if wanted == "error" else "",
+            f"The reference itself has the uncertainty {self.meta['reference'][of]:.1g}." if wanted == "error" else "",
             nearest=nearest,
-            do=f"Raise {wanted}, or measure other methods and settings.",
+            do=f"Raise {wanted}, or measure other methods, settings and models.",
             limit=limit,
-            uncertainty=self.uncertainty,
+            uncertainty=self.meta["reference"][of],
         )
 
-    def plot(self, ax=None, cost: str = "seconds", title: str = ""):
-        """Draw the work-precision diagram: error of the motion over cost, with a line for each method and drift.
+    def plot(self, ax=None, cost: str = "seconds", title: str = "", of: str = "error"):
+        """Draw the work-precision diagram: error over cost, with a line for each model, method and drift.
 
         Parameters
         ----------
         ax : Axes, optional
         cost : {"seconds", "evaluations", "steps"}
         title : str
+        of : {"error", "actuation"}
 
         Returns
         -------
@@ -187,14 +188,7 @@ class TradeOff(Study):
         """
         from servoctl.figures.work_precision import draw_tradeoff
 
-        return draw_tradeoff(self, ax, as_cost(cost), text("title", title))
-
-    def _good(self):
-        return np.flatnonzero(np.isfinite(self["error"]) & np.isfinite(self["seconds"]))
-
-    def _errors(self):
-        """Errors, at least the uncertainty of the reference."""
-        return np.maximum(self["error"], self.uncertainty)
+        return draw_tradeoff(self, ax, named(cost, COSTS, "cost"), text("title", title), named(of, ERRORS, "error"))
 
     def _tables(self):
         return Shown._tables(self)
@@ -205,7 +199,7 @@ class TradeOff(Study):
         front = self.pareto()
         shown = np.unique(np.linspace(0, len(front) - 1, min(SHOWN, len(front))).round().astype(int))
         lines = [
-            f"Trade-off: {len(self)} rows, {len(self) - len(self._good())} without numbers; t = {t0:g} .. {t1:g} s"
+            f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers; t = {t0:g} .. {t1:g} s"
             + ("; interrupted" if self.meta.get("message") else ""),
             f"  reference: {reference['method']}; {reference['verified by']} agrees to {reference['error']:.1e}, "
             f"actuation to {reference['actuation']:.1e}",
@@ -213,47 +207,53 @@ class TradeOff(Study):
             f"  fastest for each error, {len(shown)} of {len(front)}:" if len(front) else "  every run failed",
         ]
         names = ("method", "drift", "setting", "value", "error", "actuation", "evaluations", "seconds")
+        names = ("model", *names) if len(self.meta["models"]) > 1 else names
         return "\n".join([*lines, *table(front.take(shown), names, SHOWN)])
 
 
 def tradeoff(
-    model: Model,
-    x0: State | np.ndarray,
+    model: Model | Mapping[str, Model],
+    start: State | np.ndarray,
     t_span: tuple[float, float],
-    methods: Sequence[str] | str | None = None,
+    methods: Sequence[str] | str | Mapping[str, Sequence[float]] | None = None,
     drift: Sequence | None = None,
     *,
-    settings: Mapping[str, Sequence[float]] | None = None,
+    outputs: Sequence[str] | Mapping[str, float] | None = None,
     seconds: float = 0.3,
     progress: bool | None = None,
 ) -> TradeOff:
-    """Measure error and cost of methods, settings and treatments of drift on one motion.
+    """Measure error and cost of methods, settings and treatments of drift on one motion, of one model or several.
 
     The reference is the Taylor method of order 16 at a tolerance of 1e-15, or, where nothing is integrated, Newton's
     method at each instant. A second method verifies it. Their difference is the uncertainty of the reference; smaller
-    errors are marked as not resolved.
+    errors are marked as not resolved. The motions of simpler models of the same scene are compared with that of the
+    first one: what they save in time, and cost in error.
 
     Main arguments
 
     Parameters
     ----------
-    model : Model
-    x0 : State or (n_x,) array
-        From `model.start`.
+    model : Model, or dict of str to Model
+        Several models by name: the first is the reference of all.
+    start : State or (n_x,) array
+        From `model.start`, of the first model. The others start as near to it as possible, and hold the coordinates and
+        rates that it holds.
     t_span : (t0, t1)
         [s]
-    methods : sequence of str, optional
-        Names of methods as in `simulate`; default: "algebraic" where the program determines the motion completely, so
-        that nothing is integrated, else all.
+    methods : sequence of str, or dict of str to sequence of float, optional
+        Names of methods as in `simulate`, or the settings of each method by its name: tolerances of the adaptive
+        methods, steps of those of fixed step, spacings of the instants of "algebraic" [s]. Default: "algebraic" where
+        the program determines the motion completely, so that nothing is integrated, else all; of several models
+        "Taylor" and "RadauIIA". Default tolerances are 1e-3 to 1e-13, atol is a hundredth of rtol; default steps
+        (t1 - t0)/(5·4ᵏ), k = 0 .. 6.
     drift : sequence, optional
-        Treatments as in `simulate`; default: None, "project" and poles at -50/(t1 - t0).
+        Treatments as in `simulate`; default: None, "project" and poles at -50/(t1 - t0), of several models "project".
 
     Other arguments
 
-    settings : dict of str to sequence of float, optional
-        "rtol": tolerances of the adaptive methods, default 1e-3 to 1e-13; atol is a hundredth of rtol. "step": steps
-        of the methods of fixed step, and spacings of the instants of "algebraic" [s]; default (t1 - t0)/(5·4ᵏ),
-        k = 0 .. 6.
+    outputs : sequence of str, or dict of str to float, optional
+        Signals that all models have, of which the error is taken, or the sizes to which it is relative by their names,
+        in their units; default: the coordinates and rates that all have, relative to their largest magnitudes.
     seconds : float
         Time that one run may take [s]. A longer one is stopped, and finer settings are skipped if it had taken more
         than a few steps; the column failure says so.
@@ -263,7 +263,8 @@ def tradeoff(
     Returns
     -------
     TradeOff
-        After Ctrl-C the rows measured so far, with `meta["message"]` "interrupted".
+        What a model cannot do is a row with the reason. After Ctrl-C the rows measured so far, with `meta["message"]`
+        "interrupted".
 
     Raises
     ------
@@ -271,126 +272,86 @@ def tradeoff(
         If the reference cannot be computed, such as SingularProgram where the motion ends.
     InconsistentStart
         For a start off the constraints.
+    NameUnknown
+        For a method or a signal that does not exist.
     SpecificationError
-        For invalid settings.
+        For invalid settings, and for models that have no coordinate in common.
     """
-    require_kind(Model, "model", model, "sv.derive(mechanism, program)")
-    t0, t1 = as_span(t_span)
-    settings = _ladders(mapping(settings, "The settings"), abs(t1 - t0))
-    limit = positive("seconds", seconds)
-    drifts = (None, "project", abs(t1 - t0) / TIME_CONSTANT) if drift is None else drift
-    combinations = _combinations(model, methods, drifts if isinstance(drifts, (list, tuple)) else [drifts])
-    total = sum(len(settings[_kind(method)]) for method, _ in combinations)
-    with progress_bar("tradeoff", progress, total, unit="run") as bar, warnings.catch_warnings():
+    models = _as_models(model)
+    span, limit = as_span(t_span), positive("seconds", seconds)
+    candidates = {name: _candidates(each, methods, drift, span, len(models)) for name, each in models.items()}
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # steps outside the stable range: their errors are measured
-        reference, rows, interrupted = Reference(model, x0, (t0, t1), limit), [], False
-        try:
-            for method, treatment in combinations:
-                for row in _ladder(reference, method, treatment, settings[_kind(method)], limit):
-                    rows.append(row)
-                    bar.update()
-        except KeyboardInterrupt:
-            interrupted = True
-    columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
-    meta = {"t_span": [t0, t1], "seconds": limit, "reference": reference.agreement, "machine": machine()}
-    meta |= {"message": "interrupted" if interrupted else "", "measured": time.strftime("%Y-%m-%d")}
-    return TradeOff("tradeoff", columns, meta)
-
-
-# --- the reference
-
-
-class Reference:
-    """The motion with which others are compared, at any instants.
-
-    `check` is the run at `times` of the method that verified it, the first that ends within ten times `seconds`.
-    `agreement` has both methods and their differences.
-    """
-
-    def __init__(self, model, x0, t_span, seconds, checks=CHECKS):
-        consistent_state(model, x0, t_span[0])
-        self.model, self.start, self.span, self._runs = model, x0, t_span, {}
-        self.knots = [k for k in model.require_smooth((min(t_span), max(t_span))) if min(t_span) < k < max(t_span)]
-        t0, t1 = t_span
-        self.few = np.union1d(np.linspace(t0, t1, INSTANTS), self.knots)
-        between = t0 + (t1 - t0) * (np.arange(COMPARED) + BETWEEN) / COMPARED
-        self.times = np.unique([t0, *between, t1, *self.knots])
-        self.method, self.drift = Taylor(16, rtol=1e-15, atol=1e-15), Project()
-        if model.flat:
-            self.method, self.drift, checks = Algebraic(), None, CHECKS[::-1]
-        self.at(self.times)
-        self.checked_by, self.check = self._verified(checks, seconds)
-
-    def _verified(self, checks, seconds):
-        """The first of the other methods that ends in time, and its run."""
-        for method in checks:
-            options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
+        motions, rows = _converged(models, start, span, limit)
+        comparison, interrupted = Comparison(motions, outputs), False
+        total = sum(len(settings) for name in motions for *_, settings in candidates[name])
+        with progress_bar("tradeoff", progress, total, unit="run") as bar:
             try:
-                return method, whole_run(simulated(self.model, self.start, self.span, method, **options))
-            except ServoError as error:
-                failure = error
-        raise failure
-
-    @functools.cached_property
-    def agreement(self):
-        """The two methods in words, and how far their motions, actuations and energies differ."""
-        exact = self.at(self.times)
-        dense = np.union1d(np.linspace(*self.span, DENSE), self.knots)
-        return {
-            "method": _text(self.method),
-            "verified by": _text(self.checked_by),
-            "error": motion_error(self.model, self.check.jets, exact.jets),
-            "actuation": relative_error(actuation(self.check), actuation(exact)),
-            "energy": _energy_balance(self.at(dense), self.knots),
-        }
-
-    def at(self, times):
-        """The run with samples at these times (N,) [s]."""
-        key = times.tobytes()
-        if key not in self._runs:
-            run = simulated(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
-            self._runs[key] = whole_run(run)
-        return self._runs[key]
+                for name, motion in motions.items():
+                    for candidate in candidates[name]:
+                        for row in _ladder(comparison, motion, candidate, limit):
+                            rows.append({"model": name, **row})
+                            bar.update()
+            except KeyboardInterrupt:
+                interrupted = True
+    columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
+    meta = {"t_span": list(span), "seconds": limit, "models": list(models), "outputs": comparison.names}
+    meta |= {"reference": comparison.agreement, "machine": machine(), "measured": time.strftime("%Y-%m-%d")}
+    return TradeOff("tradeoff", columns, meta | {"message": "interrupted" if interrupted else ""})
 
 
-class Deadline:
-    """A `progress` for `simulate` that stops a run some seconds after its first step."""
-
-    def __init__(self, seconds):
-        self.seconds, self.since, self.steps = seconds, None, 0
-
-    def __call__(self, t):
-        """Raise LimitExceeded when the time is over."""
-        now = time.perf_counter()
-        self.since, self.steps = self.since or now, self.steps + 1
-        if now - self.since > self.seconds:
-            late = f"More than {self.seconds:g} s: ended at t = {t:.4g} s"
-            raise LimitExceeded(late, seconds=self.seconds, steps=self.steps, t=t)
+# --- models and their motions
 
 
-def whole_run(run):
-    """The run, if it reached its end; one that Ctrl-C stopped ends the study."""
-    if not run.success:
-        raise KeyboardInterrupt
-    return run
+def _as_models(given):
+    """Models by name; a single one has the name ""."""
+    models = mapping(given, "The models") if isinstance(given, Mapping) else {"": given}
+    if not models:
+        raise SpecificationError("No model was given.", do='Give one, or several as {"rigid": model, ...}.', models=0)
+    for name, model in models.items():
+        require_kind(Model, f"model {name!r}" if name else "model", model, "sv.derive(mechanism, program)")
+    return models
 
 
-def actuation(run):
-    """Forces and moments that realise the program, of actuators or of the ideal reaction, (n, N)."""
-    return run.signals("inputs")[1]
+def _converged(models, start, span, seconds):
+    """The converged motions by model, and a row with the reason for each model but the first that has none."""
+    motions, rows, (first, *_) = {}, [], models
+    for name, model in models.items():
+        try:
+            near = start if name == first else _start_near(model, models[first], start, span[0])
+            motions[name] = Converged(model, near, span, seconds)
+        except ServoError as error:
+            if name == first:
+                raise
+            rows.append({"model": name, "failure": _failure(error)})
+    return motions, rows
+
+
+def _start_near(model, first, start, t):
+    """The start of a model that is nearest to that of the first one, and holds the same coordinates and rates."""
+    values = dict(zip(first.state_names, as_state(first, start, t).tolist(), strict=True))
+    common = {name: value for name, value in values.items() if name in model.state_names}
+    held = {name: common[name] for name in getattr(start, "held", ()) if name in common}
+    return model.start(t=t, guess={name: value for name, value in common.items() if name not in held} or None, **held)
+
+
+def _failure(error):
+    return f"{type(error).__name__}: {error}"
 
 
 # --- one run
 
 
-def _ladder(reference, method, treatment, settings, seconds):
+def _ladder(comparison, motion, candidate, seconds):
     """A row for each setting, from coarse to fine; those after the first too slow or unresolved one are skipped."""
+    method, treatment, settings = candidate
     skipped, name = "", _kind(method)
     for value in sorted(settings, reverse=True):
         row = {"method": method, "drift": _drift_word(treatment), "setting": name, "value": value, "failure": skipped}
         if not skipped:
             try:
-                row |= _errors_and_cost(reference, method, treatment, value, seconds)
+                row |= _errors_and_cost(comparison, motion, method_at(method, value), treatment, value, seconds)
+                row["resolved"] = row["integration"] >= comparison.agreement["error"]
                 if not row["resolved"]:
                     skipped = f"skipped: {name} = {value:g} reaches the uncertainty of the reference"
                 elif row["seconds"] > seconds:
@@ -399,24 +360,23 @@ def _ladder(reference, method, treatment, settings, seconds):
                 yield row | {"value": np.nan, "failure": str(error)}
                 return
             except ServoError as error:
-                row["failure"] = f"{type(error).__name__}: {error}"
+                row["failure"] = _failure(error)
                 if error.details.get("steps", 0) > FEW:
                     skipped = f"skipped: {name} = {value:g} took more than {seconds:g} s"
         yield row
 
 
-def _errors_and_cost(reference, name, treatment, value, seconds):
+def _errors_and_cost(comparison, motion, method, treatment, value, seconds):
     """Errors, counts and time of one setting."""
-    model, (t0, t1) = reference.model, reference.span
-    method, times = method_at(name, value), reference.few
+    (t0, t1), times = motion.span, motion.few
     if isinstance(method, Algebraic):
-        times = np.union1d(np.linspace(t0, t1, 1 + round(abs(t1 - t0) / value)), reference.knots)
+        times = np.union1d(np.linspace(t0, t1, 1 + round(abs(t1 - t0) / value)), motion.knots)
     elif isinstance(method, RungeKutta):
         times = None
 
     def at(times):
         options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
-        return whole_run(simulated(model, reference.start, reference.span, method, **options))
+        return whole_run(simulated(motion.model, motion.start, motion.span, method, **options))
 
     run, timed = at(times), []
     for _ in range(TIMED):
@@ -425,87 +385,78 @@ def _errors_and_cost(reference, name, treatment, value, seconds):
         timed.append(time.perf_counter() - since)
         if sum(timed) > ENOUGH * seconds:
             break
-    errors = _errors(reference, at(reference.times))
+    runs = [at(comparison.times)]
     if isinstance(method, Taylor) and t1 > t0:
-        between = resampled(at(np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), reference.knots)), reference.times)
-        errors["error"] = max(errors["error"], motion_error(model, between.jets, reference.at(reference.times).jets))
-    return errors | {
+        samples = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), motion.knots)
+        runs.append(resampled(at(samples), comparison.times))
+    return _errors(comparison, motion, runs) | {
+        "operations": motion.model.function("path" if motion.model.flat else "ode").operations,
         "evaluations": run.counters.get("nfev", run.counters.get("iterations", 0)),
         "steps": run.counters.get("steps", len(run.t)),
         "seconds": min(timed),
     }
 
 
-def _errors(reference, run):
-    """Errors of a run at the times of the reference."""
-    exact = reference.at(reference.times)
-    error = motion_error(reference.model, run.jets, exact.jets)
+def _errors(comparison, motion, runs):
+    """Errors of a motion at the instants of the comparison: of its samples, and of those between them."""
+    run, exact, own = runs[0], comparison.exact, motion.at(comparison.times)
     rate, work, size, law = run.signals("power")[1]
     largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
     lawful = np.abs(law).max() < 1e-9 * largest
-    energy, exact_energy = run["energy"], exact["energy"]
-    drifted = np.abs((energy - energy[0]) - (exact_energy - exact_energy[0])).max()
+    energy, own_energy = run["energy"], own["energy"]
+    drifted = np.abs((energy - energy[0]) - (own_energy - own_energy[0])).max()
     return {
-        "error": error,
-        "actuation": relative_error(actuation(run), actuation(exact)),
+        "error": max(comparison.off(each, exact) for each in runs),
+        "integration": max(comparison.off(each, own) for each in runs),
+        "actuation": comparison.forces_off(run, exact),
         "residual": max((float(np.abs(levels).max(initial=0.0)) for levels in run.residual.values()), default=0.0),
-        "energy": float(drifted / max(np.abs(exact_energy).max(), 1e-300)),
+        "energy": float(drifted / max(np.abs(own_energy).max(), 1e-300)),
         "power": float(np.abs(rate - work).max() / largest) if lawful else np.nan,
-        "resolved": bool(error >= reference.agreement["error"]),
     }
-
-
-def _energy_balance(run, knots):
-    """Largest difference between the energy gained and the work of all forces, relative to the energy (splines)."""
-    from scipy.interpolate import make_interp_spline
-
-    order = np.argsort(run.t)
-    t, work, energy = run.t[order], run.signals("power")[1][1][order], run["energy"][order]
-    gained, cuts = [0.0], [t[0], *knots, t[-1]]
-    for a, b in itertools.pairwise(cuts):
-        piece = (t >= a) & (t <= b)
-        if piece.sum() < 2:
-            return np.nan
-        spline = make_interp_spline(t[piece], work[piece], k=min(9, (piece.sum() - 1) // 2 * 2 - 1 or 1))
-        gained += list(gained[-1] + spline.antiderivative()(t[piece])[1:])
-    return float(np.abs(energy - energy[0] - gained).max() / max(np.abs(energy).max(), 1e-300))
 
 
 # --- combinations to measure
 
 
-def _combinations(model, methods, drifts):
-    """Pairs of method and treatment; "algebraic", which has no treatment, is the default for flat programs."""
+def _candidates(model, methods, drift, span, models):
+    """(method, treatment, settings) to measure; "algebraic" has no treatment, and is the default for flat programs."""
+    length = abs(span[1] - span[0])
     if methods is None:
-        methods = ["algebraic"] if model.flat else [name for name in MEASURED if name != "algebraic"]
-    methods = list(methods) if isinstance(methods, (list, tuple)) else [methods]
-    for method in methods:
+        all_methods = [name for name in MEASURED if name != "algebraic"] if models == 1 else OF_MODELS
+        methods = ["algebraic"] if model.flat else all_methods
+    if drift is None:
+        drift = (None, "project", length / TIME_CONSTANT) if models == 1 else ("project",)
+    names = list(methods) if isinstance(methods, (list, tuple, dict)) else [methods]
+    for method in names:
         if not (isinstance(method, str) and method in METHODS):
             raise unknown(method, METHODS, "method")
-    treatments = [as_drift(value) for value in drifts]
+    treatments = [as_drift(value) for value in (drift if isinstance(drift, (list, tuple)) else [drift])]
     if any(isinstance(value, Poles) and not isinstance(value.values, float) for value in treatments):
         rule, do = "A study names each treatment by one word or number.", "Give one time constant for all rows."
-        raise SpecificationError("Poles by row were given.", rule, do=do, drift=list(drifts))
-    pairs = [(m, None) for m in methods if m == "algebraic"]
-    pairs += [(m, d) for m in methods for d in treatments if m != "algebraic"]
+        raise SpecificationError("Poles by row were given.", rule, do=do, drift=drift)
+    given = methods if isinstance(methods, dict) else dict.fromkeys(names)
+    settings = {name: _settings(name, given[name], length) for name in names}
+    pairs = [(m, None) for m in names if m == "algebraic"]
+    pairs += [(m, d) for m in names for d in treatments if m != "algebraic"]
     if not pairs:
         raise SpecificationError(
-            f"methods={methods!r} and drift={drifts!r} were given.",
+            f"methods={methods!r} and drift={drift!r} were given.",
             "A study needs at least one method and one treatment of drift.",
             do="Leave both out for the defaults, or give drift=[None] for no treatment.",
             methods=methods,
-            drift=list(drifts),
+            drift=drift,
         )
-    return pairs
+    return [(method, treatment, settings[method]) for method, treatment in pairs]
 
 
-def _ladders(settings, length):
-    """Values of "rtol", and of "step" for a span of this length [s]."""
-    for name in settings:
-        named(name, ("rtol", "step"), "setting")
-    rtol = positives("rtol", settings.get("rtol", TOLERANCES), "Leave rtol out.", most=1.0)
-    step = positives("step", settings.get("step", [length / n for n in STEP_COUNTS]), "Leave step out.")
-    return {"rtol": np.ravel(rtol).tolist(), "step": np.ravel(step).tolist()}
+def _settings(method, given, length):
+    """Tolerances or steps of a method, by default for a span of this length [s]."""
+    if _kind(method) == "step":
+        values, most = [length / n for n in STEP_COUNTS] if given is None else given, np.inf
+    else:
+        values, most = TOLERANCES if given is None else given, 1.0
+    do = f"Give methods=[{method!r}] for its default settings."
+    return np.ravel(positives(f"{_kind(method)} of {method}", values, do, most=most)).tolist()
 
 
 def _kind(method):
@@ -519,11 +470,6 @@ def _drift_word(treatment):
     if isinstance(treatment, Project):
         return "project" if treatment.every == 1 else f"project {treatment.every}"
     return "none"
-
-
-def _text(method):
-    order = f" of order {method.order}" if isinstance(method, Taylor) else ""
-    return f"{method}{order}" + (f" at {method.rtol:g}" if hasattr(method, "rtol") else "")
 
 
 # --- methods and treatments in words
@@ -545,8 +491,3 @@ def arguments_of(row):
         word, _, every = drift.partition(" ")
         options["drift"] = Project(int(every)) if every else word if word in DRIFTS else float(drift)
     return options
-
-
-def as_cost(name):
-    """One of the columns that count as cost, or the error of another name."""
-    return named(name, COSTS, "cost")

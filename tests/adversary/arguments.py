@@ -97,8 +97,8 @@ def calls():
         "internal_dynamics": (sv.internal_dynamics, dict(model=s["ideal"], run=s["free"])),
         "minimum_phase": (sv.minimum_phase, dict(model=s["model"], parameter="m", values=(1.5, 2.5), at=s["model"].start())),
         "stability": (sv.stability, dict(model=s["ideal"], run=s["free"], order=12)),
-        "tradeoff": (sv.tradeoff, dict(model=s["ideal"], x0=near, t_span=span, methods=["RK4"], drift=[None],
-                                       settings={"step": [0.1]}, seconds=0.1, progress=False)),
+        "tradeoff": (sv.tradeoff, dict(model=s["ideal"], start=near, t_span=span, methods={"RK4": [0.1]}, drift=[None],
+                                       outputs=["y"], seconds=0.1, progress=False)),
         "sampled_bound": (sv.sampled_bound, dict(rho=2, delay=1)),
         "plant": (sv.plant, dict(mechanism=s["mechanism"], forces={"x": -y}, damping={"x": 1.0},
                                  limits={"pull": (-1.0, 2.0)}, rate_limits={"pull": 3.0}, lag={"lift": 0.1}, delay=0.01,
@@ -305,8 +305,7 @@ def further():
     plan, plant, law, ideal = (s[k] for k in ("plan", "plant", "law", "ideal"))
     (_, y), saved, span = s["q"], plan.save(os.path.join(s["folder"], "loaded.npz")), (0.0, 0.2)
     x0 = {"x": 0.1, "y": 0.0, "dx": 0.0, "dy": 0.0}
-    steps = {"step": [0.1, 0.05]}
-    trade = sv.tradeoff(ideal, ideal.start(y=0.1, dy=0.0), span, ["RK4"], [None], settings=steps, progress=False)
+    trade = sv.tradeoff(ideal, ideal.start(y=0.1, dy=0.0), span, {"RK4": [0.1, 0.05]}, [None], progress=False)
     linear = sv.interop.linearise(plant, 0.0, plan.state(0.0), rate=100.0), sv.interop.linearise(law, 0.0)
     return {
         "simulate accuracy": (sv.simulate, dict(model=ideal, start=ideal.start(y=0.1, dy=0.0), t_span=span,
@@ -330,10 +329,10 @@ def further():
         "Controller": (sv.Controller, dict(law=law)),
         "lqr varying": (sv.lqr, dict(plan=plan, plant=plant, rate=50.0, Q=None, R=None, integral=None)),
         "map.growth": (s["map"].growth, dict(method="RK4", step=0.1, drift=None, order=None)),
-        "TradeOff.pareto": (trade.pareto, dict(cost="seconds")),
+        "TradeOff.pareto": (trade.pareto, dict(cost="seconds", of="error")),
         "TradeOff.recommend": (lambda error: trade.recommend(error=error), dict(error=1.0)),
         "TradeOff.recommend time": (lambda seconds: trade.recommend(seconds=seconds), dict(seconds=10.0)),
-        "TradeOff.plot": (trade.plot, dict(ax=None, cost="seconds", title="")),
+        "TradeOff.plot": (trade.plot, dict(ax=None, cost="seconds", title="", of="error")),
         "plots.efforts": (sv.plots.efforts, dict(run=plan)),
         "disturbances.gust": (sv.disturbances.gust, dict(size=1.0, start=0.0, end=1.0, rise=0.1)),
         "disturbances.step": (sv.disturbances.step, dict(size=1.0, at=0.1)),
