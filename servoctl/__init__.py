@@ -11,7 +11,7 @@ from servoctl.version import __version__ as __version__
 HOMES = {  # of each public name: the module that defines it, or that it is; imported when the name is used
     "Adaptive": "methods.choice",
     "Algebraic": "methods.choice",
-    "Batch": "study.close_many",
+    "Batch": "study.batch",
     "Bounded": "methods.choice",
     "Closed": "control.result",
     "Controller": "control.law",
@@ -29,7 +29,6 @@ HOMES = {  # of each public name: the module that defines it, or that it is; imp
     "Mechanism": "spec.mechanism",
     "MinimumPhase": "inversion.output",
     "Model": "model.model",
-    "Motions": "study.many",
     "NameUnknown": "errors",
     "NotRealisable": "errors",
     "Parameters": "spec.parameters",

@@ -79,12 +79,11 @@ from servoctl.spec.mechanism import Mechanism as Mechanism
 from servoctl.spec.parameters import Parameters as Parameters
 from servoctl.spec.parameters import parameters as parameters
 from servoctl.spec.program import Program as Program
+from servoctl.study.batch import Batch as Batch
 from servoctl.study.cases import grid as grid
 from servoctl.study.cases import monte_carlo as monte_carlo
-from servoctl.study.close_many import Batch as Batch
 from servoctl.study.close_many import close_many as close_many
 from servoctl.study.load import load_study as load_study
-from servoctl.study.many import Motions as Motions
 from servoctl.study.many import simulate_many as simulate_many
 from servoctl.study.stability_map import StabilityMap as StabilityMap
 from servoctl.study.stability_map import stability as stability

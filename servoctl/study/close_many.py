@@ -1,5 +1,6 @@
 """Thousands of closed loops of one plant and one law with different numbers, in one compiled call."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -18,37 +19,11 @@ from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
 from servoctl.reduction.ranks import SUSPECT
+from servoctl.study.batch import Batch, failure, failures
 from servoctl.study.cases import CASES, as_cases
-from servoctl.study.table import Study, Traced, machine, table
-from servoctl.values import frozen
+from servoctl.study.table import Study, machine
 
 SEEDS = 2**31  # seeds of cases are below this
-
-
-@frozen(eq=False)
-class Batch(Traced):
-    """The results of many closed loops; made by `close_many`.
-
-    `batch["max |theta|"]` is a column of the table, (N,), `batch.trace["theta"]` is (K, N).
-
-    Attributes
-    ----------
-    study : Study
-        A row per case: its numbers, the seed of its noise, and for each state, input and residual (order <= 1) the
-        largest size over all samples, the root mean square and the value at the end. Results of loops that ended early
-        are NaN; "error" and "message" have the reason.
-    t : (K,) array
-        Instants of the traces [s].
-    trace : dict of str to (K, N) array
-        Traces of the signals in `record`.
-    """
-
-    def __repr__(self):
-        failed = int(np.sum(self.study["error"] != ""))
-        summary = f"{len(self)} closed loops, {failed} ended early; {self.study.meta['law']}"
-        traced = f"  traces of {', '.join(self.trace)}: {len(self.t)} samples" if self.trace else "  no traces"
-        shown = [name for name in self.study.columns if not name.startswith(("rms", "final", "message"))][:8]
-        return "\n".join([f"Batch: {summary}"[:120], traced[:120], *table(self.study, shown, most=5)])
 
 
 def close_many(
@@ -84,6 +59,8 @@ def close_many(
     Returns
     -------
     Batch
+        Its table has the numbers, the seed of the noise, and for each state, input and residual (order <= 1) the
+        largest size over all samples, the root mean square and the value at the end; its traces are those of `record`.
         After Ctrl-C it holds the finished cases, with `meta["interrupted"]` True.
 
     Raises
@@ -113,7 +90,7 @@ def close_many(
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
     meta = {
-        "t_span": [loop.t0, loop.t0 + loop.samples * loop.period], "law": run.law.name, "rate": run.law.rate,
+        "t_span": [loop.t0, loop.t0 + loop.samples * loop.period], "by": run.law.name, "rate": run.law.rate,
         "substeps": loop.substeps, "delay": loop.delay, "machine": machine(), "units": run.units,
     }  # fmt: skip
     reasons = _reasons(run, loop, numbers, seeds, gathered) if run.law.allocation else {}
@@ -322,28 +299,23 @@ def _reasons(run, loop, numbers, seeds, gathered):
 
 def _study(columns, seeds, names, gathered, meta, reasons):
     """The table, of the finished cases; results of a loop that ended early are NaN."""
-    finished = ~np.isnan(gathered.state_lost)
-    meta["interrupted"] = not finished.all()
-    if not finished.any():
+    which = np.flatnonzero(~np.isnan(gathered.state_lost))
+    meta["interrupted"] = len(which) < len(gathered.state_lost)
+    if not len(which):
         raise KeyboardInterrupt
-    numbers = {"case": np.arange(len(finished))} | columns | ({"seed": np.array(seeds)} if seeds else {})
-    numbers = {name: values[finished] for name, values in numbers.items()}
-    gathered = Gathered(**{name: values[..., finished] for name, values in vars(gathered).items()})
-    early = np.minimum(gathered.state_lost, gathered.law_lost)
-    ended = np.isfinite(early)
-    of_law = gathered.law_lost < gathered.state_lost
-    results = {}
-    for i, name in enumerate(names):
-        largest, rms, last = gathered.largest[i], gathered.rms[i], gathered.last[i]
-        results |= {f"max |{name}|": largest, f"rms {name}": rms, f"final {name}": last}
-    results = {name: np.where(ended, np.nan, values) for name, values in results.items()}
-    errors = np.where(ended, np.where(of_law, "ServoError", "IntegrationStopped"), "")
-    errors, messages = errors.astype(object), np.full(len(ended), "", dtype=object)
-    for i in np.flatnonzero(ended):
-        what = "the law's answer" if of_law[i] else "the state"
-        messages[i] = f"{what} is not finite at t = {early[i]:.6g} s"
-    for i, error in reasons.items():
-        place = int(np.sum(finished[:i]))
-        errors[place], messages[place] = type(error).__name__, str(error)
-    texts = {"error": errors.astype(str), "message": messages.astype(str)}
-    return Study("batch", numbers | results | texts, meta), gathered
+    early, of_law = np.minimum(gathered.state_lost, gathered.law_lost), gathered.law_lost < gathered.state_lost
+    errors = {i: _ended(early[i], of_law[i]) for i in np.flatnonzero(np.isfinite(early)).tolist()}
+    errors |= {i: failure(error) for i, error in reasons.items()}
+    numbers = {"case": np.arange(len(early))} | columns | ({"seed": np.array(seeds)} if seeds else {})
+    numbers = {name: values[which] for name, values in numbers.items()}
+    gathered = Gathered(**{name: values[..., which] for name, values in vars(gathered).items()})
+    parts = {"max |{}|": gathered.largest, "rms {}": gathered.rms, "final {}": gathered.last}
+    results = {of.format(name): row for of, rows in parts.items() for name, row in zip(names, rows, strict=True)}
+    results = {name: np.where(np.isfinite(early[which]), np.nan, values) for name, values in results.items()}
+    return Study("closed loops", numbers | results | failures(errors, which), meta), gathered
+
+
+def _ended(t, of_law):
+    """The columns of a failure at the time t, of the law or of the state."""
+    error, what = ("ServoError", "the law's answer") if of_law else ("IntegrationStopped", "the state")
+    return {"error": error, "message": f"{what} is not finite at t = {t:.6g} s", "facts": json.dumps({"t": t})}

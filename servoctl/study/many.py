@@ -1,7 +1,6 @@
 """Many motions of one model, with different starts and parameters, in one compiled call."""
 
 import contextlib
-import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 
@@ -22,54 +21,20 @@ from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
-from servoctl.study.cases import FAILURE, as_columns
+from servoctl.study.batch import FINAL, Batch, failure, failures
+from servoctl.study.cases import as_columns
 from servoctl.study.signals import Signals
 from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
-from servoctl.study.table import Study, Traced, machine, table
-from servoctl.values import frozen
+from servoctl.study.table import Study, machine
 
-FINAL = "final "  # names of values at the end
 SHARES = 16  # of the cases, which the workers of an executor share
-
-
-@frozen(eq=False)
-class Motions(Traced):
-    """The motions of many cases; made by `simulate_many`.
-
-    `motions["final theta"]` is a column of the table, (N,), `motions.trace["theta"]` is (K, N). Forces and outputs have
-    the names of a `Run`: `motions.trace["trolley"]` and `motions["final trolley"]` follow from the states when they are
-    read, as the signals of a `Run` do.
-
-    Attributes
-    ----------
-    study : Study
-        A row per case: its parameters, the number of steps and the final value of each state. Those of motions that
-        ended early are NaN; "error", "message" and "facts" have the reason.
-    t : (K,) array
-        Instants of the traces [s].
-    trace : mapping of str to (K, N) array
-        The signals at these, NaN for motions that ended early.
-    """
-
-    trace: Signals
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        signal = name.removeprefix(FINAL) if isinstance(name, str) else name
-        return self.study[name] if signal == name or name in self.study.columns else self.trace.final(signal)
-
-    def __repr__(self):
-        failed = int(np.sum(self.study["error"] != ""))
-        lines = [f"Motions: {len(self)} cases, {failed} with an error; {self.study.meta['method']}"]
-        lines += [f"  traces at {len(self.t)} instants" if len(self.t) else "  no traces"]
-        shown = [name for name in self.study.columns if name not in FAILURE[1:]][:8]
-        return "\n".join([*(line[:120] for line in lines), *table(self.study, shown, most=5)])
 
 
 def simulate_many(
     model: Model, starts: State | ArrayLike | Mapping[str, ArrayLike], parameters: Mapping[str, ArrayLike] | None,
     t_span: Sequence[float], method: Method | str | None = None, *, t_eval: ArrayLike | None = None,
     executor: Executor | int | None = None, progress: bool | None = None,
-) -> Motions:  # fmt: skip
+) -> Batch:  # fmt: skip
     """Simulate the motion of a program for many starts and sets of parameters.
 
     By the Taylor method the motions run in compiled code, in the lanes of vectors with steps of their own, and on
@@ -101,9 +66,9 @@ def simulate_many(
 
     Returns
     -------
-    Motions
-        A case that fails is a row with the error. After Ctrl-C it holds the finished cases, with `meta["interrupted"]`
-        True.
+    Batch
+        Its table has the parameters, the number of steps and the final value of each state. A case that fails is a row
+        with the error. After Ctrl-C it holds the finished cases, with `meta["interrupted"]` True.
 
     Raises
     ------
@@ -130,7 +95,7 @@ def simulate_many(
         else:
             motions.compute(span, method, times, executor, show)
     level = max(getattr(method, "jets", None) or 0, model.reduction.top)
-    meta = {"t_span": list(span), "method": str(method), "interrupted": motions.interrupted}
+    meta = {"t_span": list(span), "by": str(method), "interrupted": motions.interrupted}
     return motions.result(span, times, level, meta)
 
 
@@ -352,8 +317,7 @@ class _Many:
             model = self.model_of(i)
             run = simulated(model, self.start(i, model, span[0]), span, method, t_eval=t_eval, progress=False)
         except ServoError as error:
-            facts = json.dumps(error.details, default=str)
-            self.errors[i] = {"error": type(error).__name__, "message": str(error), "facts": facts}
+            self.errors[i] = failure(error)
         else:
             if not run.success:
                 raise KeyboardInterrupt
@@ -372,10 +336,7 @@ class _Many:
         columns |= {name: np.array(column)[finished] for name, column in self.columns.items()}
         columns |= {"steps": self.steps[finished]}
         columns |= {f"{FINAL}{name}": values for name, values in zip(names, self.final[finished].T.copy(), strict=True)}
-        for name in FAILURE:
-            columns[name] = np.full(len(which), "")
-            if self.errors:
-                columns[name] = np.array([self.errors.get(i, {}).get(name, "") for i in which.tolist()])
+        columns |= failures(self.errors, which)
         samples, t = self.samples[finished], _with_end(times, span)
         if len(t) > len(times):
             samples = np.append(samples, self.final[finished, None], axis=1)
@@ -383,4 +344,4 @@ class _Many:
         states, p = samples.transpose(2, 1, 0), self.parameters[finished].T
         meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
         trace = Signals(self.model, t, len(times), states, p, level, runs)
-        return Motions(Study("many", columns, meta), times, trace)
+        return Batch(Study("motions", columns, meta), times, trace)

@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import inspect
-import json
 import multiprocessing
 import pickle
 import signal
@@ -19,7 +18,8 @@ from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.progress import progress_bar
 from servoctl.run import Run
-from servoctl.study.cases import FAILURE, RESERVED, as_cases, generator
+from servoctl.study.batch import failure, failures
+from servoctl.study.cases import RESERVED, as_cases, generator
 from servoctl.study.table import Study, machine
 
 INTERRUPTED = 1  # status of a Run or Closed that Ctrl-C ended
@@ -99,7 +99,7 @@ def evaluate(case, index, parameters, seed):
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # SystemExit and GeneratorExit, too: no case ends the sweep
-        return {"case": index, "error": type(error).__name__, **_said(error)}
+        return {"case": index, **failure(error)}
     return {"case": index, "numbers": numbers}
 
 
@@ -107,16 +107,6 @@ def leave_interrupts_to_parent():
     """Ignore Ctrl-C in a worker process: the parent handles it, and workers finish what they are at."""
     if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _said(error):
-    """Message and facts (JSON) of an error, empty where they cannot be written."""
-    said = {"message": "", "facts": "{}"}
-    with contextlib.suppress(Exception):
-        said["message"] = str(error)
-    with contextlib.suppress(Exception):
-        said["facts"] = json.dumps(getattr(error, "details", {}), default=str)
-    return said
 
 
 def _results(result, parameters):
@@ -325,9 +315,7 @@ def died(row, count):
 
 def _columns(cases, rows):
     """The table of rows in the order of their cases."""
-    rows = [rows[i] for i in sorted(rows)]
-    results = dict.fromkeys(name for row in rows for name in row.get("numbers", ()))
-    columns = {"case": [row["case"] for row in rows]}
-    columns |= {name: [cases[row["case"]][name] for row in rows] for name in cases[0]}
-    columns |= {name: [row.get("numbers", {}).get(name) for row in rows] for name in results}
-    return columns | {name: np.array([row.get(name, "") for row in rows], dtype=str) for name in FAILURE}
+    which, found = sorted(rows), {i: row.get("numbers", {}) for i, row in rows.items()}
+    columns = {"case": which} | {name: [cases[i][name] for i in which] for name in cases[0]}
+    columns |= {name: [found[i].get(name) for i in which] for name in dict.fromkeys(n for i in which for n in found[i])}
+    return columns | failures(rows, which)

@@ -30,7 +30,7 @@ class Study(Shown):
     Attributes
     ----------
     kind : str
-        "tradeoff", "sweep", "many" or "batch".
+        "tradeoff", "sweep", "motions" or "closed loops".
     columns : dict of str to (N,) array
         Numbers or texts by name. A missing number is NaN, a missing text is empty.
     meta : dict
@@ -211,29 +211,6 @@ def machine():
         "compiler": compiler() or "none: loops are interpreted",
         "versions": dict(_versions()),
     }
-
-
-@frozen(eq=False)
-class Traced(Shown):
-    """A table with a row per case, and traces of signals at common instants.
-
-    Attributes
-    ----------
-    study : Study
-    t : (K,) array
-        [s]
-    trace : dict of str to (K, N) array
-    """
-
-    study: Study
-    t: np.ndarray
-    trace: dict[str, np.ndarray]
-
-    def __len__(self) -> int:
-        return len(self.study)
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        return self.study[name]
 
 
 @functools.cache
