@@ -21,6 +21,7 @@ from servoctl.plants.equations import equations_at
 from servoctl.reduction.ranks import SUSPECT
 from servoctl.study.batch import Batch, failure, failures
 from servoctl.study.cases import CASES, as_cases
+from servoctl.study.executor import computed
 from servoctl.study.table import Study, machine
 
 SEEDS = 2**31  # seeds of cases are below this
@@ -248,25 +249,27 @@ def _one_by_one(run, derived, loop, numbers, seeds, traced, every):
     lost = np.full((2, n), np.nan)
     results = np.full((3, size, n), np.nan)
     trace = np.full((loop.samples // every + 1 if traced else 0, len(traced), n), np.nan)
-    for i in range(n):
-        seed = seeds[i] if seeds else None
+
+    def compute(i):
+        ended = np.full(2, np.inf)
         try:
-            one = _one(run, loop, *(part[:, i] for part in numbers), seed)
+            one = _one(run, loop, *(part[:, i] for part in numbers), seeds[i] if seeds else None)
         except ServoError as error:
             if error.run is None:
                 raise
-            lost[:, i] = np.inf
-            lost[0 if isinstance(error, IntegrationStopped) else 1, i] = error.details["t"]
-            continue
-        except KeyboardInterrupt:
-            break
-        if not one.success:  # interrupted
-            break
-        lost[:, i] = np.inf
+            ended[0 if isinstance(error, IntegrationStopped) else 1] = error.details["t"]
+            return ended, np.nan, np.nan
+        if not one.success:
+            raise KeyboardInterrupt
         residuals = [one.residual[name][0] for name in (derived.residuals.names if derived.residuals else ())]
         values = np.vstack([one.states, one.inputs, *residuals])
-        results[:, :, i] = np.abs(values).max(axis=1), np.sqrt(np.mean(values**2, axis=1)), values[:, -1]
-        trace[:, :, i] = values[traced, ::every].T if traced else 0.0
+        found = np.abs(values).max(axis=1), np.sqrt(np.mean(values**2, axis=1)), values[:, -1]
+        return ended, found, values[traced, ::every].T if traced else 0.0
+
+    def take(i, found):
+        lost[:, i], results[:, :, i], trace[:, :, i] = found
+
+    computed(compute, {i: (i,) for i in range(n)}, None, take)
     return Gathered(*lost, *results, trace)
 
 

@@ -23,8 +23,8 @@ from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
 from servoctl.study.batch import FINAL, Batch, failure, failures
 from servoctl.study.cases import as_columns
+from servoctl.study.executor import computed, require_some
 from servoctl.study.signals import Signals
-from servoctl.study.sweep import died, leave_interrupts_to_parent, lost, on_executor
 from servoctl.study.table import Study, machine
 
 SHARES = 16  # of the cases, which the workers of an executor share
@@ -87,6 +87,7 @@ def simulate_many(
     times = _trace_times(span, t_eval)
     motions = _Many(model, *_case_table(model, starts, parameters), len(times))
     with progress_bar("simulate_many", progress, motions.n, unit="case") as bar:
+
         def show(count):
             bar.update(count - bar.n)
 
@@ -101,7 +102,6 @@ def simulate_many(
 
 def _share_computed(part, span, method, times):
     """A part of the cases with its results, computed by a worker."""
-    leave_interrupts_to_parent()
     part.compute(span, method, times, 1, lambda count: None)
     part.models = {}
     return part
@@ -178,21 +178,17 @@ class _Many:
         """Compute parts of the cases on an executor; those that it does not finish are rows with its error."""
         parts = dict(enumerate(np.array_split(np.arange(self.n), min(self.n, SHARES))))
         calls = {k: (self.part(which), *arguments) for k, which in parts.items()}
-        unfinished = {}
-        try:
-            for k, part, error in on_executor(executor, _share_computed, calls):
-                which = parts[k]
-                if error is None:
-                    self._join(which, part)
-                else:
-                    unfinished |= dict.fromkeys(which.tolist(), lost(error))
-                progress(int(self.done.sum()))
-        except KeyboardInterrupt:
-            self.interrupted = True
-        if unfinished and not self.done.any():
-            raise died(next(iter(unfinished.values())), self.n)
-        self.errors |= unfinished
-        self.done[list(unfinished)] = True
+
+        def take(k, part):
+            self._join(parts[k], part)
+            progress(int(self.done.sum()))
+
+        lost, interrupted = computed(_share_computed, calls, executor, take)
+        require_some(lost, self.done.any(), self.n)
+        self.interrupted |= interrupted
+        for k, failed in lost.items():
+            self.errors |= dict.fromkeys(parts[k].tolist(), failed)
+            self.done[parts[k]] = True
 
     def part(self, which):
         """The problem of some cases."""
@@ -304,12 +300,8 @@ class _Many:
 
     def one_by_one(self, span, method, times, progress):
         """Compute the others as `simulate` does."""
-        try:
-            for i in np.flatnonzero(~self.done).tolist():
-                self._one(i, span, method, times)
-                progress(int(self.done.sum()))
-        except KeyboardInterrupt:
-            self.interrupted = True
+        calls = {i: (i, span, method, times) for i in np.flatnonzero(~self.done).tolist()}
+        self.interrupted = computed(self._one, calls, None, lambda *_: progress(int(self.done.sum())))[1]
 
     def _one(self, i, span, method, times):
         t_eval = _with_end(times, span)

@@ -1,25 +1,22 @@
 """Sweeps: a function called for many cases, on any executor; the table does not depend on who computes it."""
 
-import contextlib
 import functools
 import inspect
-import multiprocessing
 import pickle
-import signal
 import sys
-import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor
 
 import numpy as np
 
 from servoctl.checks import plain, whole
 from servoctl.control.result import Closed
-from servoctl.errors import ServoError, SpecificationError
+from servoctl.errors import SpecificationError
 from servoctl.progress import progress_bar
 from servoctl.run import Run
 from servoctl.study.batch import failure, failures
 from servoctl.study.cases import RESERVED, as_cases, generator
+from servoctl.study.executor import computed, require_some
 from servoctl.study.table import Study, machine
 
 INTERRUPTED = 1  # status of a Run or Closed that Ctrl-C ended
@@ -73,17 +70,15 @@ def sweep(
     seed = _seed(case, seed)
     _require_fitting(case, cases[0], seed)
     _require_sendable(case, executor)
-    computed = _in_turn if executor is None else functools.partial(_on, executor)
-    rows, unfinished, interrupted = {}, {}, False
+    rows, calls = {}, {i: (case, i, parameters, seed) for i, parameters in enumerate(cases)}
     with progress_bar("sweep", progress, len(cases), unit="case") as bar:
-        try:
-            for i, row, finished in computed(case, cases, seed):
-                (rows if finished else unfinished)[i] = row
-                bar.update()
-        except KeyboardInterrupt:
-            interrupted = True
-    if unfinished and not rows:
-        raise died(next(iter(unfinished.values())), len(cases))
+
+        def take(i, row):
+            rows[i] = row
+            bar.update()
+
+        unfinished, interrupted = computed(evaluate, calls, executor, take)
+    require_some(unfinished, rows, len(cases))
     meta = {"case": name_of(case), "seed": seed, "count": len(cases), "parameters": list(cases[0])}
     meta |= {"lost": sorted(unfinished), "interrupted": interrupted, "machine": machine()}
     columns = _columns(cases, rows | unfinished)
@@ -91,22 +86,15 @@ def sweep(
 
 
 def evaluate(case, index, parameters, seed):
-    """One row: case (the index), with the numbers of the case or its error, message and facts (JSON)."""
-    leave_interrupts_to_parent()
+    """One row: the numbers of a case, or its error, message and facts (JSON)."""
     random = {} if seed is None else {"rng": generator(seed, index)}
     try:
         numbers = _results(case(**parameters, **random), parameters)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # SystemExit and GeneratorExit, too: no case ends the sweep
-        return {"case": index, **failure(error)}
-    return {"case": index, "numbers": numbers}
-
-
-def leave_interrupts_to_parent():
-    """Ignore Ctrl-C in a worker process: the parent handles it, and workers finish what they are at."""
-    if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return failure(error)
+    return {"numbers": numbers}
 
 
 def _results(result, parameters):
@@ -152,75 +140,6 @@ def summary(run):
 def _extrema(run, names):
     ends = {"min": np.min, "max": np.max, "end": lambda values: values[-1]}
     return {f"{name}_{end}": float(of(run[name])) for name in names for end, of in ends.items()}
-
-
-# --- where cases are computed
-
-
-def _in_turn(case, cases, seed):
-    """Rows (index, row, finished) computed in this process."""
-    with _recorded_interrupts() as interrupts:
-        for i, parameters in enumerate(cases):
-            row = evaluate(case, i, parameters, seed)
-            if interrupts:
-                raise KeyboardInterrupt  # which `simulate` inside the case caught: its row is that of half a run
-            yield i, row, True
-
-
-def _on(executor, case, cases, seed):
-    """Rows (index, row, finished) as an executor finishes them; a case that it did not finish has its error."""
-    calls = {i: (case, i, parameters, seed) for i, parameters in enumerate(cases)}
-    for i, row, error in on_executor(executor, evaluate, calls):
-        yield i, row if error is None else {"case": i} | lost(error), error is None
-
-
-def on_executor(executor, function, calls):
-    """(key, result, error) of calls {key: arguments} as an executor finishes them; Ctrl-C cancels those not begun."""
-    futures, unsent = {}, {}
-    try:
-        for key, arguments in calls.items():
-            try:
-                futures[executor.submit(function, *arguments)] = key
-            except RuntimeError as error:  # the pool has died, or was shut down
-                unsent[key] = error
-        for future in as_completed(futures):
-            try:
-                result = future.result()
-            except Exception as error:
-                yield futures[future], None, error
-            else:
-                yield futures[future], result, None
-    except (KeyboardInterrupt, GeneratorExit):
-        for future in futures:
-            future.cancel()
-        raise
-    yield from ((key, None, error) for key, error in unsent.items())
-
-
-def lost(error):
-    """The columns `FAILURE` of a case that an executor did not finish."""
-    message = f"The executor did not finish this case{f': {error}' if str(error) else '.'}"
-    return {"error": type(error).__name__, "message": message, "facts": "{}"}
-
-
-@contextlib.contextmanager
-def _recorded_interrupts():
-    """A list to which every Ctrl-C is appended, also where the KeyboardInterrupt is caught inside."""
-    interrupts = []
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield interrupts
-        return
-
-    def record(number, frame):
-        interrupts.append(number)
-        signal.default_int_handler(number, frame)
-
-    signal.signal(signal.SIGINT, record)
-    try:
-        yield interrupts
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # --- checks of the input
@@ -299,18 +218,6 @@ def _message(columns, meta):
     parts += [f"{lost} not finished by the executor"] if lost else []
     parts += ["interrupted"] if meta["interrupted"] else []
     return ", ".join(parts)
-
-
-def died(row, count):
-    """The error of an executor that finished none of `count` cases."""
-    return ServoError(
-        f"The executor finished none of {count} cases. {row['error']}: {row['message']}",
-        "Each worker imports the module of the case and must have the memory that a case needs.",
-        do='Start the sweep of a script below if __name__ == "__main__".',
-        error=row["error"],
-        message=row["message"],
-        cases=count,
-    )
 
 
 def _columns(cases, rows):
