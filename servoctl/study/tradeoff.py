@@ -440,7 +440,7 @@ def _errors(reference, run):
     """Errors of a run at the times of the reference."""
     exact = reference.at(reference.times)
     error = motion_error(reference.model, run.jets, exact.jets)
-    rate, work, size, law = run.signals("power")[1]
+    rate, work, size, law, _ = run.signals("power")[1]
     largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
     lawful = np.abs(law).max() < 1e-9 * largest
     energy, exact_energy = run["energy"], exact["energy"]

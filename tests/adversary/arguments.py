@@ -218,7 +218,7 @@ def inverses():
     event = sv.Event("y", 0.05)
     return {
         "report": (sv.report, dict(model=sway["model"], run=sway["run"], limits={"cart": 50.0})),
-        "report limit": (lambda limit: sv.report(s["model"], s["plan"], limits={"pull": limit}), dict(limit=50.0)),
+        "report limit": (lambda limit: sv.report(s["plan"], limits={"pull": limit}), dict(limit=50.0)),
         "report mechanism": (sv.report, dict(model=mechanism, run=program)),
         "inverse": (sv.inverse, dict(mechanism=mechanism, program=program, t_span=span, start=None, method=None,
                                      limits={"pull": 50.0}, bounds={"x": (-1.0, 2.0)}, weight=None)),
@@ -240,8 +240,8 @@ def inverses():
         "Event": (sv.Event, dict(signal="y", value=0.05, terminal=2, direction=-1.0)),
         "sensitivity": (sv.sensitivity, dict(model=s["ideal"], run=free, of="y", to=["m", "y"])),
         "sensitivity flat": (sv.sensitivity, dict(model=s["model"], run=s["plan"], of=["pull"], to="m")),
-        "Sensitivity": (sv.sensitivity(s["ideal"], free, "y", "m").extrema, dict(of="y")),
-        "Sensitivity[]": (sv.sensitivity(s["ideal"], free, "y", "m").__getitem__, dict(pair=("y", "m"))),
+        "Sensitivity": (sv.sensitivity(free, "y", "m").extrema, dict(of="y")),
+        "Sensitivity[]": (sv.sensitivity(free, "y", "m").__getitem__, dict(pair=("y", "m"))),
         "identify": (sv.identify, dict(plant=plant, measured=closed, parameters=["m"], noise=noise, start=None)),
         "identify log": (lambda t, pull, x: sv.identify(plant, log | {"t": t, "pull": pull, "x": x}, ["m"], noise=noise),
                          {k: log[k] for k in ("t", "pull", "x")}),
