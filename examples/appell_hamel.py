@@ -28,7 +28,7 @@ def main(fast=False):
     print(model)
     run = sv.simulate(model, model.start(dphi=1.0, dtheta=2.0), (0.0, 2.0))
     print(run)
-    proof = sv.verify(model, run, segments=3 if fast else 20)
+    proof = sv.verify(run, segments=3 if fast else 20)
     print(proof)
     names = ("x", "y", "z", "phi", "theta", "dphi", "dtheta")
     energy = run["energy"]

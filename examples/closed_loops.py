@@ -109,7 +109,7 @@ def pendubot_upright():
     with warnings.catch_warnings():  # of unstable internal dynamics: the law is there for these
         warnings.simplefilter("ignore")
         plan, nominal = planned("pendubot", build=partial(pendubot, start=90.0, end=90.0))
-    internal = sv.internal_dynamics(plan.model, plan)
+    internal = sv.internal_dynamics(plan)
     print(internal)
     try:
         sv.computed(plan, nominal)

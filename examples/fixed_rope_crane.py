@@ -51,7 +51,7 @@ def main(fast=False, save=None):
     print(front)
     plan = sv.relaxed(plant, program, (0.0, 6.0), weight=1e-8)
     print(plan)
-    proof = sv.verify(plan.model, plan)
+    proof = sv.verify(plan)
     print(proof)
     errors = zip(front["weight"], 1e3 * front["largest X"], strict=True)
     numbers = {f"error [mm], weight {weight:g}": float(error) for weight, error in errors}

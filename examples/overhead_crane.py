@@ -31,7 +31,7 @@ def main(fast=False):
     print(model)  # X, Z are differentiated twice; 1 hidden constraint; flat: nothing is integrated
     plan = sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 8.0))  # the path holds its end after 6 s
     print(plan)
-    proof = sv.verify(model, plan, segments=3 if fast else 20)
+    proof = sv.verify(plan, segments=3 if fast else 20)
     print(proof)
     numbers = {"free": model.free, "index": model.structure().index, "verified": proof.passed}
     for name in ("trolley", "hoist", "theta"):

@@ -39,7 +39,7 @@ def main(fast=False):
     start = model.start(w3=0.5, guess={"e0": 1.0})
     run = sv.simulate(model, start, (0.0, 10.0), drift="project")
     print(run)
-    proof = sv.verify(model, run, segments=3 if fast else 20)
+    proof = sv.verify(run, segments=3 if fast else 20)
     print(proof)
     length = sum(run[name] ** 2 for name in ("e0", "e1", "e2", "e3"))
     return {

@@ -43,7 +43,7 @@ def main(fast=False):
         model = sv.derive(*vehicle(weights, toward))
         run = sv.simulate(model, model.start(), (0.0, 4.0))
         print(run)
-        proof = sv.verify(model, run, segments=3 if fast else 20)
+        proof = sv.verify(run, segments=3 if fast else 20)
         print(proof)
         u = np.array([run[name] for name in model.actuators])
         numbers |= {f"{case} {name}": float(abs(values).max()) for name, values in zip(model.actuators, u, strict=True)}

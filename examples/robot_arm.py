@@ -21,7 +21,7 @@ def main(fast=False):
     start = model.start(guess=HOME)
     plan = sv.simulate(model, start, (0.0, 4.0))  # the path holds its end after 2 s
     print(plan)
-    proof = sv.verify(model, plan, segments=3 if fast else 20)
+    proof = sv.verify(plan, segments=3 if fast else 20)
     print(proof)
     numbers = {"free": model.free, "verified": proof.passed, "lift max": plan.extrema("torque_lift")[1][1]}
     known, loaded = (sv.plant(mechanism, limits=arm.effort, tool_mass=mass) for mass in (0.0, 2.0))

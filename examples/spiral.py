@@ -27,7 +27,7 @@ def main(fast=False):
     straight_on = {"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2y": 0.0, "d3y": 0.0, "d4y": 0.0}
     run = sv.simulate(model, model.start(**straight_on), (0.0, 2.0))
     print(run)
-    proof = sv.verify(model, run, segments=3 if fast else 20)
+    proof = sv.verify(run, segments=3 if fast else 20)
     print(proof)
     dx, dy = run["dx"], run["dy"]
     return {

@@ -43,7 +43,7 @@ def main(fast=False, save=None):
     mechanism, program = overhead_crane()
     law = sv.fastest(mechanism, program, LIMITS, SPAN, guess=GUESS, shape=True)
     print(law)
-    proof = sv.verify(law.plan.model, law.plan)
+    proof = sv.verify(law.plan)
     print(proof)
     numbers = {"duration [s]": float(law.plan.t[-1]), "at a limit": active(law.plan), "verified": proof.passed}
     if not fast:

@@ -32,7 +32,7 @@ def main(fast=False):
         model = sv.derive(*two_cars(by))
         print(model)
         run = sv.simulate(model, model.start(**start), (0.0, 2.0))
-        proof = sv.verify(model, run, segments=3 if fast else 20)
+        proof = sv.verify(run, segments=3 if fast else 20)
         print(proof)
         _, (instant, greatest) = run.extrema(signal)
         numbers |= {

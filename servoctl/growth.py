@@ -22,9 +22,8 @@ from servoctl.methods import flow
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.stability import stability_function
-from servoctl.model.model import Model
 from servoctl.model.switching import switching
-from servoctl.run import SAME_TIME, Run, require_model
+from servoctl.run import SAME_TIME, Run, require_run
 from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
@@ -203,14 +202,12 @@ class InternalDynamics(Shown):
         return "\n".join(lines)
 
 
-def internal_dynamics(model: Model, run: Run, period: float | None = None) -> InternalDynamics:
+def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics:
     """Measure how errors in the internal dynamics grow along a run.
 
     Parameters
     ----------
-    model : Model
     run : Run
-        A motion of it.
     period : float, optional
         Of the linearisation along the motion [s], for Floquet's multipliers over its first period.
 
@@ -221,14 +218,14 @@ def internal_dynamics(model: Model, run: Run, period: float | None = None) -> In
     Raises
     ------
     SpecificationError
-        If the run is not of this model (a loaded run has none), is shorter than the period, or does not have it.
+        If the run has no model, is shorter than the period, or does not have it.
 
     Notes
     -----
     Instants are taken from the samples, more and more until growth by steps twice as long agrees; where the samples
     are too few, the motion is integrated between them.
     """
-    model = require_model(model, run, "internal_dynamics")
+    model = require_run(run, "internal_dynamics")
     if model.flat:
         return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
     if switch := stays_on_kink(model, run):

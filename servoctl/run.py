@@ -649,24 +649,14 @@ def on_side(model, branches):
     return family.at(branches) if family and len(branches) == len(family.switches) else model
 
 
-def require_model(model, run, what):
-    """The model, with the coordinates that the run has and it leaves out; a run of another model, or none, is refused.
-
-    `what` is the function that needs both.
-    """
-    if getattr(run, "model", None) is not None and hasattr(model, "including"):
-        model = model.including(run.jet_names)
-    states = getattr(model, "state_names", ())
-    if getattr(run, "model", None) is None or not hasattr(model, "reduction"):
-        which = " without its model" if hasattr(run, "jets") else ""
-    elif run.jet_names[: len(states)] != tuple(states):
-        which = " of another model"
-    else:
-        return model
+def require_run(run, what):
+    """The model of a run; what is no run, or has no model, is refused. `what` is the function that needs it."""
+    if isinstance(run, Run) and hasattr(run.model, "reduction"):
+        return run.model
+    which = " without its model" if isinstance(run, Run) else ""
     raise SpecificationError(
-        f"sv.{what} received a {type(model).__name__} and a {type(run).__name__}{which}.",
-        "It needs a model and a run of this model; a run that was loaded from a file has none.",
-        do=f"Write sv.{what}(model, run), or simulate again.",
-        model=type(model).__name__,
+        f"sv.{what} received a {type(run).__name__}{which}.",
+        "It needs a run, which knows its model; one that was loaded from a file is given it.",
+        do=f"Write sv.{what}(run), and sv.load(path, model) for a run from a file.",
         run=type(run).__name__,
     )

@@ -317,7 +317,7 @@ def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
         if not run.success or _quiet(run, by_series):
             return known
         run = run if again is None else again()
-        internal = internal_dynamics(run.model, run) if run.success else None
+        internal = internal_dynamics(run) if run.success else None
     except KeyboardInterrupt:
         return _interrupted_at_its_end(known)
     if internal is None:  # interrupted while it was computed with more samples
@@ -337,7 +337,7 @@ def _quiet(run, by_series):
 
 def _verdict(run, _=None, *, tolerance):
     """The verdict on the internal dynamics of a run, for those of its samples that are left."""
-    return internal_dynamics(run.model, run).facts(tolerance)
+    return internal_dynamics(run).facts(tolerance)
 
 
 def _model_and_start(model, start, inputs):

@@ -102,7 +102,7 @@ def double_pendulum(run):
 
 def _slowest(run):
     """The slowest mode of the internal dynamics at the start [rad/s]."""
-    return np.abs(sv.internal_dynamics(run.model, run).eigenvalues[:, 0].imag).min()
+    return np.abs(sv.internal_dynamics(run).eigenvalues[:, 0].imag).min()
 
 
 def four_bar(run):
@@ -228,7 +228,7 @@ def acrobot_poles():
 
 def _poles(run, sample):
     """Eigenvalues of the internal dynamics at a sample."""
-    return sv.internal_dynamics(run.model, run).eigenvalues[:, sample]
+    return sv.internal_dynamics(run).eigenvalues[:, sample]
 
 
 def furuta_pendulum(run):

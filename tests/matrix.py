@@ -175,7 +175,7 @@ def _in_motion(build, scene, guess):
     run, facts, more = plan(build, scene.t_span, guess, {})
     if run is None:
         return {"fine": False, **more}
-    remarks = [text for text in sv.verify(run.model, run).remarks if "first transient" in text]
+    remarks = [text for text in sv.verify(run).remarks if "first transient" in text]
     (above, force), free = transient(run), run.start.free
     kept = all(abs(run.start[n] - guess[n]) <= 1e-9 * (1.0 + abs(guess[n])) for n in free if n in guess)
     fine = kept and bool(remarks) == (above > 1.01)

@@ -220,8 +220,8 @@ def test_a_program_of_a_speed_has_the_inverse_of_its_place(damping):
     assert damping or np.abs(place["F"]).max() == pytest.approx(9.28, abs=5e-3)  # N, of the tutorial
     for name in ("F", "x", "theta"):
         assert np.abs(speed[name] - place[name]).max() < 1e-9 * np.abs(place[name]).max()
-    assert sv.verify(speed.model, speed).passed
-    slopes = [sv.sensitivity(run.model, run, ("F", "theta"), ("m", "L")) for run in (speed, place)]
+    assert sv.verify(speed).passed
+    slopes = [sv.sensitivity(run, ("F", "theta"), ("m", "L")) for run in (speed, place)]
     for pair in itertools.product(("F", "theta"), ("m", "L")):
         assert np.abs(slopes[0][pair] - slopes[1][pair]).max() < 1e-8 * (0.01 + np.abs(slopes[1][pair]).max())
 
@@ -239,7 +239,7 @@ def test_a_cart_whose_speed_goes_on_has_the_inverse_of_its_place(damping):
     assert "inverse: bounded" in speed.message and "0 is the constant of x" in speed.message
     for name in ("F", "x", "theta"):
         assert np.abs(speed[name] - place[name]).max() < 1e-9 * np.abs(place[name]).max()
-    assert sv.verify(speed.model, speed).passed
+    assert sv.verify(speed).passed
 
 
 def segway(by):
@@ -269,7 +269,7 @@ def test_a_segway_by_its_speed_and_its_rate_of_turn_stays_upright_and_exact():
         assert np.abs(speed[name] - heading[name]).max() < 1e-8 * np.abs(heading[name]).max()
     way = 3.0 * np.array([np.sin(1.2), 1.0 - np.cos(1.2)]) / 1.2  # as both follow the same blend
     assert [speed["x"][-1], speed["y"][-1]] == pytest.approx(way, abs=1e-9)
-    assert sv.verify(speed.model, speed).passed
+    assert sv.verify(speed).passed
 
 
 @pytest.mark.parametrize(("gravity", "word"), [(G, "non-minimum phase (hyperbolic)"), (-G, "marginal")])

@@ -79,7 +79,7 @@ def test_the_passive_arm_of_known_numbers():
     assert fine["torque"].min() == pytest.approx(-48.83509, abs=1e-5)
     assert fine["torque"].max() == pytest.approx(48.88454, abs=1e-5)
     assert run.t[0] < -1.0 and run.t[-1] > 3.0 and abs(run["torque"][0]) < 1e-2  # moves ahead of the program
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_the_aircraft_of_known_numbers():
@@ -91,7 +91,7 @@ def test_the_aircraft_of_known_numbers():
     assert np.degrees(np.abs(fine["theta"]).max()) == pytest.approx(64.8117, abs=1e-4)
     thrusts = np.stack([fine["u1"], fine["u2"]])
     assert thrusts.min() == pytest.approx(131.3045, abs=1e-4) and thrusts.max() == pytest.approx(485.9057, abs=1e-4)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_a_general_solver_finds_the_same_motion():
@@ -145,7 +145,7 @@ def test_the_error_of_the_window_falls_with_its_length(make, span):
 def test_quick_steps_of_a_cart_pole(duration):
     model, start = cart_pole(step(duration))
     run = sv.simulate(model, start, (0.0, duration), sv.Bounded())
-    assert run["a"][0] > 0 > run["a"][-1] and sv.verify(model, run).passed  # leans forward before the cart moves
+    assert run["a"][0] > 0 > run["a"][-1] and sv.verify(run).passed  # leans forward before the cart moves
     assert np.abs(run["x"][run.t <= 0]).max() < 1e-12
 
 
@@ -211,7 +211,7 @@ def test_a_law_of_a_bounded_plan_in_c_and_under_limits(arm_plan, tmp_path):
 
 def test_a_bounded_plan_in_files_verdicts_and_loops_of_many_cases(arm_plan, tmp_path):
     assert sv.load(arm_plan.save(tmp_path / "plan"), arm_plan.model) == arm_plan
-    assert sv.internal_dynamics(arm_plan.model, arm_plan).verdict == "unstable"  # open loop, and the plan is exact
+    assert sv.internal_dynamics(arm_plan).verdict == "unstable"  # open loop, and the plan is exact
     plant = sv.plant(arm_plan.model.reduction.mechanism)
     law = sv.lqr(arm_plan, plant, rate=100.0)
     run = sv.close(plant, law, arm_plan.state(arm_plan.t[0]), (arm_plan.t[0], arm_plan.t[0] + 5.0))
@@ -287,10 +287,10 @@ def test_a_program_of_accelerations_has_no_invariants():
         lambda t, x, v, a: a[0] + 3 * v[0] + 2 * x[0] - 2 * step()(t),
     )
     run = sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
-    assert not model.invariant_names() and sv.verify(model, run).passed
+    assert not model.invariant_names() and sv.verify(run).passed
     assert run.state(run.t[0])[1] == pytest.approx(0.0, abs=1e-4) and run.state(run.t[-1])[1] == pytest.approx(-0.25, abs=1e-4)
     assert run.state(1.0)[1] == pytest.approx(convolved(lambda s: run.state(np.clip(s, *run.t[[0, -1]]))[0], 2.0, 1.0), abs=1e-6)
-    assert "hyperbolic" in sv.report(model, run).verdict
+    assert "hyperbolic" in sv.report(run).verdict
 
 
 def test_accelerations_that_leave_an_oscillation_are_marginal():
@@ -306,7 +306,7 @@ def test_samples_within_the_window():
     whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
     times = np.linspace(whole.t[0], whole.t[-1], 2001)
     run = sv.simulate(model, model.start(), (0.0, 2.0), "bounded", t_eval=times)
-    assert np.array_equal(run.t, times) and "leave out" not in run.message and sv.verify(model, run).passed
+    assert np.array_equal(run.t, times) and "leave out" not in run.message and sv.verify(run).passed
     assert np.abs(run["torque"] - np.interp(times, whole.t, whole["torque"])).max() < 0.05
     part = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=[0.0, 1.0, 2.5])
     assert "leave out the motion before t = 0 s;" in part.message and "after" not in part.message

@@ -172,7 +172,7 @@ def test_a_deep_plan_takes_few_operations_and_agrees_with_series(name):
     assert model.flat and model.operations()["path"] <= min(most, few * (N / (N // 2)) ** 3.2)
     for signal, values in reference(N).items():
         assert np.abs(run[signal] - values).max() < 1e-11 * np.abs(values).max(), signal
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 # the same as by one expression of each row ---------------------------------------------------------------------------
@@ -232,7 +232,7 @@ def test_a_function_of_the_state_takes_what_is_not_replaced_from_it():
     """A nonlinear spring before a damper is beyond combinations of expressions, which leave x2'' squared."""
     model = sv.derive(*chain(4, cubic, damper=1))
     run = sv.simulate(model, model.start(), SPAN, t_eval=TIMES)
-    assert model.free == 1 and sv.verify(model, run).passed
+    assert model.free == 1 and sv.verify(run).passed
 
 
 @pytest.mark.parametrize("name", ["last damper", "first damper"])
@@ -252,7 +252,7 @@ def test_drift_is_treated(drift, pairs):
 @pytest.mark.parametrize("name", ["velocities by place", "first damper"])
 def test_sensitivities_agree(name, pairs):
     forces, parameters = pairs(name)[0].actuators, pairs(name)[0].numbers
-    by_blocks, by_expressions = (sv.sensitivity(model, moved(model)) for model in pairs(name))
+    by_blocks, by_expressions = (sv.sensitivity(moved(model)) for model in pairs(name))
     for pair in ((force, p) for force in forces for p in parameters):
         size = np.abs(by_expressions[pair]).max()
         assert by_blocks[pair] == pytest.approx(by_expressions[pair], abs=1e-8 * size + 1e-12)

@@ -84,15 +84,14 @@ def before(run, t):
 @pytest.mark.parametrize(("name", "method", "drift"), CASES)
 def test_motions_pass(name, method, drift, scene_run):
     model, run = scene_run(name, method, drift)
-    proof = sv.verify(model, run, segments=3)
+    proof = sv.verify(run, segments=3)
     if name in STOPS:
         assert STOPS[name] - 0.05 < run.t[-1] < STOPS[name] + 1e-2 and not run.success
-        proof = sv.verify(model, before(run, STOPS[name] - 0.02), segments=3)
+        proof = sv.verify(before(run, STOPS[name] - 0.02), segments=3)
     else:
         assert run.success
     by_poles = method == "RK4" and drift is not None and drift != "project"
-    assert proof.numbers["acceleration"] <= (1e-6 if by_poles else 1e-9)
-    assert proof.numbers["multiplier form"] <= (1e-6 if by_poles else 1e-9)
+    assert proof.numbers["balance"] <= (1e-6 if by_poles else 1e-9)
     assert proof.passed or by_poles
     assert worst_of_3_18(run) <= (1e-6 if by_poles else 1e-9)
 
@@ -100,18 +99,18 @@ def test_motions_pass(name, method, drift, scene_run):
 @pytest.mark.parametrize("name", [name for name in CERTIFIED if name not in STOPS])
 def test_default_runs_pass_in_twenty_restarted_segments(name, scene_run):
     model, run = scene_run(name)
-    proof = sv.verify(model, run)
+    proof = sv.verify(run)
     assert proof.passed and run.success, proof
     assert proof.numbers["segments"] < 1e-6
-    assert "power" in proof.numbers and proof.numbers["power"] < 1e-8
+    assert "energy" in proof.numbers and proof.numbers["energy"] < 1e-5
     assert len(repr(proof).splitlines()) <= 8 and "passed" in repr(proof)
 
 
 @pytest.mark.parametrize("name", STOPS)
 def test_runs_that_stop_are_told(name, scene_run):
     model, run = scene_run(name)
-    proof = sv.verify(model, run, segments=3)
-    assert proof.numbers["acceleration"] <= 1e-9
+    proof = sv.verify(run, segments=3)
+    assert proof.numbers["balance"] <= 1e-9
     assert any("did not reach its end" in note for note in proof.notes)
 
 
@@ -121,17 +120,15 @@ def test_certificates_have_teeth(name, scene_run):
     k = len(run.t) // 3
     bent = run.jets.copy()
     bent[model.nq + model.n, k] += 1e-6 * np.abs(bent[model.nq + model.n :]).max()  # an acceleration, at one sample
-    proof = sv.verify(model, replace(run, jets=bent, stored={}, stored_residual={}), segments=3)
-    assert not proof.passed
-    assert ("multiplier form" if model.ideal else "acceleration") in proof.failures
-    assert "FAILED" in repr(proof)
+    proof = sv.verify(replace(run, jets=bent, stored={}, stored_residual={}), segments=3)
+    assert proof.verdict == "failed" and "FAILED" in repr(proof)  # the balance, or a row where reactions take it up
 
 
 def test_a_drifted_state_fails(scene_run):
     model, run = scene_run("appell-hamel")
     moved = run.jets.copy()
     moved[2] += 1e-3  # z off the string
-    proof = sv.verify(model, replace(run, jets=moved, stored={}, stored_residual={}), segments=3)
+    proof = sv.verify(replace(run, jets=moved, stored={}, stored_residual={}), segments=3)
     assert "residual string" in proof.failures
 
 
@@ -143,7 +140,7 @@ def test_higher_jets_excuse_no_residual(gallery_model):
     moved[2] += 1e-5  # z off the string
     short = moved[: len(model.jet_names)]
     found = [
-        sv.verify(model, replace(run, jets=jets, jet_names=names, stored={}, stored_residual={}), segments=1)
+        sv.verify(replace(run, jets=jets, jet_names=names, stored={}, stored_residual={}), segments=1)
         for jets, names in ((moved, run.jet_names), (short, model.jet_names))
     ]
     assert np.abs(moved).max() > 100 * np.abs(short).max()
@@ -155,27 +152,22 @@ def test_every_number_has_its_limit_beside_it(scene_run):
     model, run = scene_run("appell-hamel")
     moved = run.jets.copy()
     moved[2] += 1e-3
-    text = repr(sv.verify(model, replace(run, jets=moved, stored={}, stored_residual={}), segments=3))
+    text = repr(sv.verify(replace(run, jets=moved, stored={}, stored_residual={}), segments=3))
     assert "limit 1.0e-06: largest residual, derivatives included (string)  FAILED" in text
-    lines = repr(sv.verify(model, run, segments=3)).splitlines()
+    lines = repr(sv.verify(run, segments=3)).splitlines()
     assert lines[0] == "Verification: passed" and len({line.index(", limit ") for line in lines[1:]}) == 1
 
 
 @pytest.mark.parametrize("segments", [0, -1, "a", 2.5, True, None, 10_001, 1e300, 2**70, ca.SX.sym("n")], ids=str)
 def test_segments_that_check_nothing_are_refused(segments, scene_run):
     with refused(sv.SpecificationError, "segments"):
-        sv.verify(*scene_run("overhead-crane"), segments=segments)
-
-
-def test_a_run_of_another_model_is_refused(scene_run):
-    with refused(sv.SpecificationError, "verify", "Run"):
-        sv.verify(scene_run("vtol")[0], scene_run("overhead-crane")[1])
+        sv.verify(scene_run("overhead-crane")[1], segments=segments)
 
 
 @pytest.mark.parametrize("name", ["two-cars-ideal", "appell-hamel", "constant-speed"])
 def test_what_actuators_cannot_give_of_an_ideal_reaction_is_told(name, scene_run):
     model, run = scene_run(name)
-    proof = sv.verify(model, run, segments=3)
+    proof = sv.verify(run, segments=3)
     if model.actuators:
         assert proof.numbers["outside"] > 0.1  # the reaction of the program is not in the actuators' reach
     else:

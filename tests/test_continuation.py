@@ -131,7 +131,7 @@ def test_no_sample_falls_on_the_zero_of_a_pivot(elbow):
         assert run["u"][run.t == t] == pytest.approx([torque("spiral", t, elbow)], abs=1e-6)
     if elbow > 0:
         assert -12.56 < run["u"][run.t == 1.0] < -12.55
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_a_law_made_of_such_a_plan_holds_the_tip():

@@ -59,7 +59,7 @@ def test_every_method_moves_a_plant(machine, method):
     assert [run["d2x"], run["d2theta"]] == pytest.approx(np.array(rates).T[2:], abs=1e-6)
     assert "trolley" in repr(run) and "no program" in repr(run.model)
     if method is None:
-        assert sv.verify(run.model, run).passed
+        assert sv.verify(run).passed
 
 
 FORCES = {
@@ -88,7 +88,7 @@ def test_inputs_stay_within_their_limits(machine):
     run = sv.simulate(plant, START, (0.0, 6.0), inputs={"trolley": 5 * ca.sin(machine.mechanism.q.t)})
     assert run["trolley"] == pytest.approx(np.clip(5 * np.sin(run.t), -1.0, 2.0), abs=1e-14)
     assert ends(run) == pytest.approx(reference(plant, lambda t: np.clip(5 * np.sin(t), -1.0, 2.0), 6.0), abs=1e-5)
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize("method", [None, "Taylor", "RK4"])
@@ -99,8 +99,8 @@ def test_a_plant_that_falls_has_no_internal_dynamics(machine, method):
         warnings.simplefilter("error")
         run = sv.simulate(machine, START | {"theta": 3.1}, (0.0, 4.0), method, inputs={"trolley": 0.0}, t_eval=times)
     assert run.internal == {} and np.array_equal(run.t, times)
-    assert sv.internal_dynamics(run.model, run).verdict == "unstable", "of errors near upright"
-    assert sv.verify(run.model, run).passed
+    assert sv.internal_dynamics(run).verdict == "unstable", "of errors near upright"
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize("part", ["a force", "an input", "states", "parameters"])
@@ -117,9 +117,9 @@ def test_wrong_runs_of_a_plant_do_not_pass(machine, part):
         model = sv.simulate(machine, START, (0.0, 0.1), inputs={"trolley": 5.01 * ca.sin(t)}).model
     if part != "states":
         with refused(sv.SpecificationError):
-            sv.verify(model, run)
+            sv.verify(run)
     jets = run.jets if part != "states" else run.jets * np.where(np.arange(len(run.t)) == 500, 1.001, 1.0)
-    assert not sv.verify(model, replace(run, model=model, jets=jets, variants=(), stored={}, stored_residual={})).passed
+    assert not sv.verify(replace(run, model=model, jets=jets, variants=(), stored={}, stored_residual={})).passed
 
 
 def test_material_constraints_hold_in_a_driven_plant():
@@ -137,7 +137,7 @@ def test_material_constraints_hold_in_a_driven_plant():
 
     angle = solve_ivp(swing, (0.0, 2.0), [0.0, 0.0], "DOP853", rtol=1e-12, atol=1e-13).y[0, -1]
     assert [run["x"][-1], run["y"][-1]] == pytest.approx([np.cos(angle), np.sin(angle)], abs=1e-6)
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
     with refused(sv.InconsistentStart, "rod"):
         sv.simulate(plant, [1.1, 0.0, 0.0, 0.0], (0.0, 2.0))
 

@@ -43,14 +43,14 @@ def largest(signal, closed_form):
 
 def decay(run):
     """The slowest decay of the internal dynamics, at the start [1/s]."""
-    return -sv.internal_dynamics(run.model, run).eigenvalues[:, 0].real.max()
+    return -sv.internal_dynamics(run).eigenvalues[:, 0].real.max()
 
 
 def swing(run):
     """Frequency [rad/s] of the pendubot's second link about the hanging pose, m2 g l2/2 over I2 + m2 l2²/4."""
     inertia, damping = 0.07 + 3.0 * 0.25**2, 0.05
     rate = np.sqrt(3.0 * 9.81 * 0.25 / inertia - (damping / inertia / 2) ** 2)
-    return np.abs(sv.internal_dynamics(run.model, run).eigenvalues[:, 0].imag).max(), rate
+    return np.abs(sv.internal_dynamics(run).eigenvalues[:, 0].imag).max(), rate
 
 
 def three_cars(t):
@@ -127,5 +127,5 @@ def test_a_scene_has_the_units_of_its_signals(name):
 @pytest.mark.parametrize("name", [name for name in gallery if name not in CERTIFIED])
 def test_a_scene_passes(name, motion):
     run = motion(name)
-    proof = sv.verify(run.model, run)
+    proof = sv.verify(run)
     assert run.success and proof.passed, proof

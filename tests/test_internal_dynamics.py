@@ -25,7 +25,7 @@ from servoctl.methods.taylor import last_index
 
 def internal(pair, span, start, **guess):
     model = sv.derive(*pair)
-    return sv.internal_dynamics(model, sv.simulate(model, model.start(guess=guess, **start), span))
+    return sv.internal_dynamics(sv.simulate(model, model.start(guess=guess, **start), span))
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_run_without_its_model_is_refused(tmp_path):
     run = sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 0.5))
     for other, kind in ((sv.load(run.save(tmp_path / "run")), "Run"), (None, "NoneType")):
         with refused(sv.SpecificationError, "internal_dynamics", kind):
-            sv.internal_dynamics(model, other)
+            sv.internal_dynamics(other)
 
 
 # a body of which the program says nothing: its motion is the internal dynamics --------------------------------------
@@ -102,7 +102,7 @@ def moved(model, length, *method, x=1e-3, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         run = sv.simulate(model, model.start(x=x, dx=0.0), (0.0, length), *method, **options)
-    return run, sv.internal_dynamics(model, run)
+    return run, sv.internal_dynamics(run)
 
 
 def mathieu(depth, damping=0.1):
@@ -150,7 +150,7 @@ def test_spans_of_whole_periods_are_judged_like_others():
 def test_multipliers_are_those_of_the_propagator_over_a_period(depth, verdict):
     model = passive(mathieu(depth))
     run, _ = moved(model, 20.0)
-    found = sv.internal_dynamics(model, run, period=pi)
+    found = sv.internal_dynamics(run, period=pi)
     expected = np.linalg.eigvals(fundamental(pi, depth))
     expected = expected[np.argsort(-np.abs(expected))]
     assert np.sort(np.abs(found.multipliers)) == pytest.approx(np.sort(np.abs(expected)), rel=2e-3)
@@ -162,11 +162,11 @@ def test_a_period_that_is_none_is_refused():
     model = passive(mathieu(0.6))
     run, _ = moved(model, 20.0)
     with refused(sv.SpecificationError, "3 s", period=3.0):
-        sv.internal_dynamics(model, run, period=3.0)
+        sv.internal_dynamics(run, period=3.0)
     with refused(sv.SpecificationError, "30 s", period=30.0):
-        sv.internal_dynamics(model, run, period=30.0)
+        sv.internal_dynamics(run, period=30.0)
     with refused(sv.SpecificationError, "period"):
-        sv.internal_dynamics(model, run, period=-1.0)
+        sv.internal_dynamics(run, period=-1.0)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -225,7 +225,7 @@ def test_what_is_unstable_before_nothing_resolves_it_is_unstable(most, monkeypat
     with warned("unstable"):
         run = sv.simulate(model, model.start(x=0.1, dx=0.0), (0.0, 6.0))
     assert growth._resolved(model, run) is None
-    found = sv.internal_dynamics(model, run)
+    found = sv.internal_dynamics(run)
     assert found.verdict == "unstable" and found.length < 6.0 and 10 < found.growth < 1e3
 
 
@@ -270,7 +270,7 @@ def test_phases_that_drift_apart_are_no_instability():
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         run = sv.simulate(model, model.start(guess={"x": 0.8, "y": -0.6}, dx=0.0), (0.0, 40.0), drift="project")
-    found = sv.internal_dynamics(model, run)
+    found = sv.internal_dynamics(run)
     assert found.verdict == "neutral" and 10 < found.growth < 100
 
 
@@ -310,7 +310,7 @@ def test_a_ball_on_a_turning_table_is_neutral(length):
     model = ball_on_a_table()
     start = model.start(X=0.5, Y=0.0, phi=0.0, e0=1.0, e1=0.0, e2=0.0, e3=0.0, vx=0.0, vy=0.3, w3=0.2)
     run = sv.simulate(model, start, (0.0, length), drift="project")
-    found = sv.internal_dynamics(model, run)
+    found = sv.internal_dynamics(run)
     assert run["e0"].min() < 0 < run["e0"].max()
     assert found.verdict == "neutral" and found.growth < 3
 
@@ -334,7 +334,7 @@ def test_a_tilted_ball_in_its_own_axes_is_neutral(tilt, samples):
     start = model.start(X=1.0, Y=0.0, vx=0.0, vy=0.3, w3=0.0, guess={"e0": 1.0}, **values)
     run = sv.simulate(model, start, (0.0, 30.0), t_eval=np.linspace(0.0, 30.0, samples))
     assert run["vx"] + 1j * run["vy"] == pytest.approx(0.3j * np.exp(2j / 7 * table * run.t), abs=1e-7)
-    assert run.internal["verdict"] == sv.internal_dynamics(model, run).verdict == "neutral"
+    assert run.internal["verdict"] == sv.internal_dynamics(run).verdict == "neutral"
 
 
 @pytest.mark.parametrize("length", [5.0, 10.0, 60.0])
@@ -342,7 +342,7 @@ def test_a_spinning_satellite_is_neutral(length):
     example = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "quaternion.py"), run_name="example")
     model = sv.derive(example["mechanism"], example["program"])
     run = sv.simulate(model, model.start(w3=0.5, guess={"e0": 1.0}), (0.0, length), drift="project")
-    found = sv.internal_dynamics(model, run)
+    found = sv.internal_dynamics(run)
     assert found.verdict == "neutral" and found.growth < 3
 
 
@@ -354,7 +354,7 @@ def test_runs_carry_the_verdict_and_flat_ones_need_none(tmp_path, gallery_model)
     with warned("unstable over these 1 s"):
         run = sv.simulate(model, model.start(**gallery["vtol-centre"].start), (0.0, 1.0))
     assert "internal dynamics unstable over these 1 s: errors grow by" in repr(run)
-    assert run.internal["growth"] == sv.internal_dynamics(model, run).growth > 100
+    assert run.internal["growth"] == sv.internal_dynamics(run).growth > 100
     loaded = sv.load(run.save(tmp_path / "run"))
     assert loaded.internal == run.internal and loaded.internal["text"] in repr(loaded)
     flat = sv.derive(*cars())
@@ -366,7 +366,7 @@ def test_a_motion_that_grows_beyond_its_tolerance_says_how_long_it_is_good():
     with warned("good for 6.9 s"):  # 1e-9 e^(2 t) = 1e-3
         run = sv.simulate(model, model.start(x=1e-3, dx=0.0), (0.0, 12.0))
     assert run.internal["good for"] == pytest.approx(np.log(1e6) / 2, rel=0.02)
-    assert sv.internal_dynamics(model, run).good_for(1e-12) == pytest.approx(np.log(1e9) / 2, rel=0.02)
+    assert sv.internal_dynamics(run).good_for(1e-12) == pytest.approx(np.log(1e9) / 2, rel=0.02)
 
 
 def test_a_stopped_motion_carries_the_verdict_too():
@@ -381,7 +381,7 @@ def test_samples_that_resolve_nothing_are_inconclusive():
     run, _ = moved(model, 120.0)
     jets = run.jets.copy()
     jets[:, ::2] *= 1.5  # no motion
-    found = sv.internal_dynamics(model, replace(run, jets=jets))
+    found = sv.internal_dynamics(replace(run, jets=jets))
     assert found.verdict == "inconclusive" and np.isnan(found.growth) and "t_eval" in repr(found)
 
 
@@ -400,7 +400,7 @@ def test_a_bound_of_the_growth_settles_what_is_quiet(name, gallery_model, monkey
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
     assert not calls and (model.flat or growth_bound(model, run) < 10)
     if not model.flat:
-        assert dict(run.internal) == real(model, run).facts() and run.internal == run.internal and len(calls) == 1
+        assert dict(run.internal) == real(run).facts() and run.internal == run.internal and len(calls) == 1
         assert run.internal["growth"] < 10
 
 
@@ -590,7 +590,7 @@ def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_m
     monkeypatch.setattr(simulation, "internal_dynamics", lambda *a: calls.append(a) or real(*a))
     run = sv.simulate(model, start, span, t_eval=t_eval)
     assert growth_bound(model, run) > 10 or t_eval
-    assert not calls and 30 < sv.internal_dynamics(model, run).growth < 52
+    assert not calls and 30 < sv.internal_dynamics(run).growth < 52
 
 
 def test_what_takes_less_time_tells_first_that_growth_is_harmless(gallery_model, monkeypatch):
@@ -631,7 +631,7 @@ def test_blocks_of_unequal_times_do_not_make_growth_exponential(length, samples,
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run = sv.simulate(model, start, (0.0, length), t_eval=np.linspace(0.0, length, samples))
-    found = sv.internal_dynamics(model, run)
+    found = sv.internal_dynamics(run)
     assert run.internal["verdict"] == "neutral"
     assert found.growth == pytest.approx({9.0: 33.5, 20.0: 80.0}[length], rel=0.05)
     if samples > 41 or length > 9.0:  # 41 samples give 3.01, within the two percent of growth by longer steps

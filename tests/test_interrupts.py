@@ -97,7 +97,7 @@ def test_a_motion_is_kept_when_its_growth_is_judged(wheel_model, while_, ctrl_c,
     ctrl_c(60.0)
     run = sv.simulate(model, start, (0.0, 1.0), t_eval=[0.0, 0.5, 1.0])
     assert (run.status, run.success) == (1, False) and "interrupted at its end" in run.message
-    assert run.t.tolist() == [0.0, 0.5, 1.0] and sv.internal_dynamics(model, run) is not None
+    assert run.t.tolist() == [0.0, 0.5, 1.0] and sv.internal_dynamics(run) is not None
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_every_scene_has_an_inverse_or_an_end(name):
         way = "instant by instant" if name in FLAT else "bounded" if name in HYPERBOLIC else "forward"
         assert said(run).startswith(f"{way}, as the program is ")
         assert run.success and run.internal.get("verdict") != "unstable"
-        assert sv.verify(run.model, run).passed
+        assert sv.verify(run).passed
 
 
 def test_a_flat_program_is_solved_instant_by_instant():
@@ -71,7 +71,7 @@ def test_a_hyperbolic_program_gets_its_bounded_motion(make, span, name, value):
     assert run.method == "bounded" and "hyperbolic" in said(run)
     peaks = [v for signal in run.model.actuators for _, v in run.extrema(signal)]
     assert max(peaks) == pytest.approx(value, abs=1e-4)
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_a_flexible_link_of_eight_segments_gets_its_bounded_motion():
@@ -90,7 +90,7 @@ def test_a_flexible_link_of_eight_segments_gets_its_bounded_motion():
 
     run = sv.inverse(mechanism, program, (0.0, 2.2))
     assert run.method == "bounded" and run.counters["intervals"] < 2000
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
     assert np.abs([run[f"q{i}"][0] for i in range(n)]).max() < 1e-6
 
 
@@ -118,7 +118,7 @@ def test_a_start_near_a_rest_serves_relaxed_plans_too():
     run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
     assert said(run).startswith("relaxed, as the program is singular at rest")
     assert run["l"][[0, -1]] == pytest.approx(4.0 + 981.0 / 1e4, abs=1e-9)
-    assert np.abs(run.residual["X"]).max() < 3e-3 and sv.verify(run.model, run).passed
+    assert np.abs(run.residual["X"]).max() < 3e-3 and sv.verify(run).passed
 
 
 def test_a_marginal_program_is_integrated_forward_and_says_that_it_swings_on():
@@ -134,7 +134,7 @@ def test_a_marginal_program_is_integrated_forward_and_says_that_it_swings_on():
 
     other = solve_ivp(rates, (0.0, 2.0), [0.0, 0.0], "DOP853", rtol=1e-10, atol=1e-12)
     assert [run["a"][-1], run["da"][-1]] == pytest.approx(other.y[:, -1].tolist(), abs=1e-7)
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_a_marginal_program_that_comes_to_rest_is_not_warned_about(recwarn):
@@ -247,7 +247,7 @@ def test_an_unstable_program_that_never_rests_gets_a_plan_that_does_not_grow(k, 
     error = np.abs(run["y"] + np.sin(run.t) / (k + 1))
     layer = np.exp(-np.sqrt(k) * (T - run.t)) / k  # of the quasi-static value's error
     assert np.all(error < 1.5 * layer / k**0.5 + 1e-4 / k)
-    assert np.abs(run.residual["X"]).max() < 1e-3 and sv.verify(run.model, run).passed
+    assert np.abs(run.residual["X"]).max() < 1e-3 and sv.verify(run).passed
 
 
 @pytest.mark.parametrize("k", [4.0, 2500.0])
@@ -263,7 +263,7 @@ def test_a_plan_that_begins_in_motion_begins_on_its_bounded_motion(k, start, rec
     early = run.t < 6.0 - 8 / np.sqrt(k)
     exact = -np.sin(run.t) / (k + 1) + c * np.exp(-np.sqrt(k) * run.t)
     assert run["y"][early] == pytest.approx(exact[early], abs=1e-3 / k)
-    assert np.abs(run.residual["X"]).max() < 1e-3 and sv.verify(run.model, run).passed
+    assert np.abs(run.residual["X"]).max() < 1e-3 and sv.verify(run).passed
 
 
 def sway():
@@ -282,7 +282,7 @@ def test_an_upright_pole_leans_from_the_first_instant_of_a_sway(recwarn):
     late = (run.t > 2.0) & (run.t < 4.0)
     assert run["a"][late] == pytest.approx(-1.2 / 11.81 * np.sin(2 * run.t[late]), abs=2e-3)
     assert np.abs(run.residual["x"]).max() < 1e-3 * 0.6 and np.abs(run["F"]).max() < 1.5
-    assert not recwarn.list and sv.verify(run.model, run).passed
+    assert not recwarn.list and sv.verify(run).passed
 
 
 def test_an_upright_pole_falls_along_a_forward_plan_and_has_a_relaxed_one(recwarn):

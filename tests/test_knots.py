@@ -236,7 +236,7 @@ def test_a_sample_on_a_jump_of_a_force_has_the_acceleration_of_that_instant(opti
     run = servoctl.simulate(model, model.start(t=span[0], y=1.0, dy=0.0), span, **options)
     late = run.t >= 1.3 if included else run.t > 1.3
     assert 1.3 in run.t and run["d2y"] == pytest.approx(5.0 * late - run["y"], abs=1e-9)
-    assert servoctl.verify(model, run).passed
+    assert servoctl.verify(run).passed
 
 
 def test_remembered_knots_are_those_of_their_numbers_and_span():

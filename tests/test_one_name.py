@@ -195,11 +195,11 @@ def test_weights_and_wishes_are_of_actuators(name):
 
 def test_parameters_go_by_their_longer_name_among_initial_values(plan):
     model = plan.model
-    found = sv.sensitivity(model, plan, of=["x", "x_input", "x_output"], to="m1_parameter")
+    found = sv.sensitivity(plan, of=["x", "x_input", "x_output"], to="m1_parameter")
     for name, slope in (("x", 0.0), ("x_input", -np.cos(plan.t)), ("x_output", 0.0)):
         assert np.abs(found[name, "m1_parameter"] - slope).max() < 1e-9, name
     with refused(sv.SpecificationError):  # the initial value of the coordinate, which the program determines
-        sv.sensitivity(model, plan, of="x_input", to="m1")
+        sv.sensitivity(plan, of="x_input", to="m1")
     assert model.numbers == {"m1_parameter": 2.0, "m2": 3.0}
     assert model.with_parameters(m1=4.0) == model.with_parameters(m1_parameter=4.0) != model
     many = sv.simulate_many(model, plan.start, {"m1": [2.0, 4.0]}, SPAN, t_eval=plan.t)
@@ -217,7 +217,7 @@ def test_free_motions_differ_by_parameter_and_by_initial_value():
     plant = sv.plant(mechanism, x=4.0)
     model = sv.derive(mechanism, sv.Program({"x": q.d(1)[0] + q[0] - p.x}))  # x = p + (x0 - p) e^-t
     run = sv.simulate(model, model.start(x=1.0), SPAN)
-    found, decay = sv.sensitivity(model, run, of="x", to=["x", "x_parameter"]), np.exp(-run.t)
+    found, decay = sv.sensitivity(run, of="x", to=["x", "x_parameter"]), np.exp(-run.t)
     assert np.abs(run["x"] - (2.0 - decay)).max() < 1e-7 and plant.parameters[0] == 4.0
     assert np.abs(found["x", "x"] - decay).max() < 1e-6 and np.abs(found["x", "x_parameter"] - (1 - decay)).max() < 1e-6
 

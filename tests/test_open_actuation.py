@@ -98,7 +98,7 @@ def test_quasi_velocities_do_not_change_the_actuation():
     for name, frame in {"plain": None, **frames}.items():
         model = sv.derive(*arm({"elbow": 2.0}, posture, frame=frame))
         runs[name] = sv.simulate(model, elbow_up(model), (0.0, 2.5), method, t_eval=t_eval)
-        assert sv.verify(model, runs[name]).passed
+        assert sv.verify(runs[name]).passed
     for name in frames:
         for joint in JOINTS:
             assert runs[name][joint] == pytest.approx(runs["plain"][joint], abs=1e-6)
@@ -123,7 +123,7 @@ def precise():
 )  # fmt: skip
 def test_every_method_integrates_the_same_self_motion(options, precise):
     run = sv.simulate(precise.model, precise.start, (0.0, 2.5), t_eval=precise.t, **options)
-    assert run["wrist"] == pytest.approx(precise["wrist"], abs=2e-5) and sv.verify(precise.model, run).passed
+    assert run["wrist"] == pytest.approx(precise["wrist"], abs=2e-5) and sv.verify(run).passed
 
 
 # singular decoupling --------------------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ def test_the_choice_follows_hidden_rows_where_the_decoupling_is_singular(weights
     for name, values in expected.items():
         assert run[name] == pytest.approx(values, rel=1e-9, abs=1e-7), name
     assert run["hoist"] == pytest.approx(one["hoist"], rel=1e-9)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def plant_derivatives(mechanism, program, highest):
@@ -223,7 +223,7 @@ def test_the_least_norm_by_the_derivative_array_of_the_plant(weights):
     assert model.free == 2
     start = model.start(guess={"l": 4.0}, s=0.1, ds=0.2)
     run = sv.simulate(model, start, (0.0, 0.6), t_eval=np.linspace(0.0, 0.6, 13))
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     rows = plant_derivatives(mechanism, program, 4)
     w = np.array([(weights or {}).get(name, 1.0) for name in actuators])
     for k in range(0, 13, 3):
@@ -253,7 +253,7 @@ def test_the_determined_combinations_change_along_a_turn():
     model = sv.derive(*hovercraft({"wheel": 3.0}, lambda q: {"wheel": -0.3 * q.d(1)[3]}), guess={"psi": 3.1, "x": 2.0})
     start = model.start(guess={"psi": 3.14, "dpsi": 0.5, "x": 2.0}, phi=0.1, dphi=2.0)
     run = sv.simulate(model, start, (0.0, 10.0))
-    assert sv.verify(model, run).passed and run["psi"][-1] > 12.0
+    assert sv.verify(run).passed and run["psi"][-1] > 12.0
     a = np.array([-2 * np.cos(run.t), -np.sin(run.t)])
     assert np.cos(run["psi"]) * a[1] - np.sin(run["psi"]) * a[0] == pytest.approx(np.zeros(len(run.t)), abs=1e-7)
     assert run["thrust"] == pytest.approx(4 * np.hypot(*a), rel=1e-7)
@@ -326,8 +326,8 @@ def test_two_forces_normal_to_the_body_are_flat_after_extension():
     assert structure.zeros_at_infinity == (2, 4) and structure.essential_orders == (4, 4) and structure.index == 5
     assert "no vector relative degree" in repr(structure) and "flat" in repr(model)
     run = sv.simulate(model, model.start(guess={"theta": 0.0}), (0.0, 4.0))
-    assert sv.verify(model, run).passed
-    told = repr(sv.report(model, run))
+    assert sv.verify(run).passed
+    told = repr(sv.report(run))
     assert told.startswith("Report: flat") and "index 5; mixed realisation" in told
     # tanθ = -X''/(Z'' + g), u1 + u2 = M |(X'', Z'' + g)|
     assert np.tan(run["theta"]) == pytest.approx(-run["d2x"] / (run["d2z"] + 9.81), abs=1e-9)
@@ -354,7 +354,7 @@ def test_a_third_force_normal_to_the_body_shares_and_leaves_no_self_motion():
     short = np.array([thrust, moment]) - E @ wish
     u = wish + inverse @ E.T @ np.linalg.solve(E @ inverse @ E.T, short)
     assert np.array([run[name] for name in actuators]) == pytest.approx(u, rel=1e-8, abs=1e-6)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_rows_that_no_actuator_moves_stay_refused():
@@ -426,7 +426,7 @@ def test_a_wish_that_damps_makes_the_run_stable():
     for name, toward in (("open", None), ("damped", lambda q: damping(q, 6.0))):
         model = sv.derive(*arm(toward=toward, gravity=0.0))
         run = sv.simulate(model, elbow_up(model), (0.0, 6.0))
-        ends[name] = sv.internal_dynamics(model, run)
+        ends[name] = sv.internal_dynamics(run)
     assert ends["damped"].verdict in ("stable", "neutral") and ends["damped"].left < ends["open"].left
 
 
@@ -481,7 +481,7 @@ def test_feedforward_sweeps_and_files_know_wishes(reaching, tmp_path):
     assert again["wrist"] == pytest.approx(reaching["wrist"], rel=1e-12, abs=1e-12)
     reaching.save(tmp_path / "run.npz")
     loaded = sv.load(tmp_path / "run.npz", model=model)
-    assert sv.verify(model, loaded).passed
+    assert sv.verify(loaded).passed
 
 
 def test_the_exported_feedforward_has_the_wish(reaching, tmp_path, c_compiler):
@@ -527,7 +527,7 @@ def test_parameters_that_make_the_decoupling_singular_and_back():
         changed, fresh = sv.derive(*cars(first)).with_parameters(alpha=then), sv.derive(*cars(then))
         start = {"c": 0.2, "dc": 0.1} | ({"s": 0.1, "ds": 0.05} if free == 4 else {})
         runs = [sv.simulate(m, m.start(**start), (0.0, 2.0), t_eval=np.linspace(0, 2, 21)) for m in (changed, fresh)]
-        assert changed.free == fresh.free == free and sv.verify(changed, runs[0]).passed
+        assert changed.free == fresh.free == free and sv.verify(runs[0]).passed
         for name in "FGH":
             assert runs[0][name] == pytest.approx(runs[1][name], rel=1e-9, abs=1e-9)
 

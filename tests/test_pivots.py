@@ -110,7 +110,7 @@ def test_a_redundant_arm_changes_its_pivots_once(which, method, counted):
     runs = [sv.simulate(model, start, (0.0, 2.0), method) for _ in range(2)]
     assert counted["derived"] == 0 and np.array_equal(*(run.jets for run in runs))
     assert runs[0].counters["pivot_changes"] == 1
-    assert sv.verify(model, runs[0]).passed
+    assert sv.verify(runs[0]).passed
 
 
 def two_links(order=0):
@@ -243,7 +243,7 @@ def test_blocks_and_hidden_rows_change_their_pivots(stages, order, derived, coun
     run = sv.simulate(model, start, (0.0, 12.0), method)
     assert counted["derived"] == derived and run.counters["pivot_changes"] >= 7
     assert len({id(variant) for *_, variant in run.variants}) <= 4
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     loaded = sv.load(run.save(tmp_path / "run"), model)
     assert loaded == run and [v.place for *_, v in loaded.variants] == [v.place for *_, v in run.variants]
     again = sv.simulate(model, start, (0.0, 12.0), method)
@@ -259,7 +259,7 @@ def test_a_choice_of_pivots_that_returns_is_derived_once(name, derived, variants
         counted["derived"] = 0
         run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
         assert counted["derived"] == expected and len({id(variant) for *_, variant in run.variants}) <= variants
-        assert run.success and sv.verify(model, run).passed
+        assert run.success and sv.verify(run).passed
 
 
 def test_other_parameters_take_over_the_pivots_of_a_start(counted):
@@ -270,13 +270,13 @@ def test_other_parameters_take_over_the_pivots_of_a_start(counted):
         counted["derived"] = 0
         other = model.with_parameters(**changes)
         runs.append(sv.simulate(other, other.start(**scene.start, guess=scene.guess), (0.0, 0.5)))
-        assert counted["derived"] == derived and sv.verify(other, runs[-1]).passed
+        assert counted["derived"] == derived and sv.verify(runs[-1]).passed
     alone = pickle.loads(pickle.dumps(other))
     again = sv.simulate(alone, alone.start(**scene.start, guess=scene.guess), (0.0, 0.5))
     assert np.array_equal(runs[-1].jets, again.jets)
     shorter = model.with_parameters(L=0.8)  # coordinates that are zero but for rounding have their usual sizes
     run = sv.simulate(shorter, shorter.start(**scene.start, guess=scene.guess), (0.0, 0.5))
-    assert run.success and sv.verify(shorter, run).passed
+    assert run.success and sv.verify(run).passed
 
 
 @pytest.mark.parametrize(("slope", "derived"), [(3.0, 0), (1.0, 0), (0.02, 1)])

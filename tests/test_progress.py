@@ -96,6 +96,6 @@ def test_deriving_compiling_starting_and_verifying_are_named(terminal, monkeypat
     monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path))
     model = sv.derive(*scene.build())
     run = sv.simulate(model, model.start(**scene.start), scene.t_span, "RK4", progress=False)
-    sv.verify(model, run)
+    sv.verify(run)
     names = {name for name, _ in LINE.findall(terminal.written())}
     assert names >= {"deriving", "solving for the start", "verifying"}

@@ -294,7 +294,7 @@ def test_the_rate_of_a_constant_heading_of_a_moving_car_holds_its_steering_strai
     with warned("'heading'", "product", "tan(delta) or v"):
         model = derive(mechanism, program)
     run = simulate(model, model.start(x=0.0, y=0.0, psi=0.3), (0.0, 3.0))
-    assert model.free == 3 and run.message == "finished" and verify(model, run).passed
+    assert model.free == 3 and run.message == "finished" and verify(run).passed
     assert run["x"][-1] == pytest.approx(3.0 * scale * np.cos(0.3), rel=1e-12)
     assert run["psi"] == pytest.approx(0.3, abs=1e-12) and run["delta"] == pytest.approx(0.0, abs=1e-12)
 
@@ -797,7 +797,7 @@ def test_a_jet_that_is_zero_in_every_motion_divides_no_row(turned):
     run = simulate(model, model.start(x=0.0, y=0.0, dx=1.0, dy=0.0, guess=guess), (0.0, 1.0))
     assert run["x"] == pytest.approx(run.t - 5 * sine * run.t**2, abs=1e-9)
     assert run["y"] == pytest.approx(5 * cosine * run.t**2, abs=1e-9)
-    assert verify(model, run).passed
+    assert verify(run).passed
 
 
 def test_a_ball_rolls_from_the_identity():
@@ -838,7 +838,7 @@ def test_a_rolling_machine_of_few_velocities_is_programmed_by_rates():
     model = derive(mechanism, sv.Program({name: q.dt(residual, 1) for name, residual in path.items()}))
     run = simulate(model, model.start(x=0.0, y=0.0, guess={"v": 1.0}), (0.0, 2.0))
     assert run["x"] == pytest.approx(run.t, abs=1e-9) and run["y"] == pytest.approx(0.1 * run.t**2, abs=1e-9)
-    assert run["v"] == pytest.approx(np.hypot(1, 0.2 * run.t), abs=1e-9) and verify(model, run).passed
+    assert run["v"] == pytest.approx(np.hypot(1, 0.2 * run.t), abs=1e-9) and verify(run).passed
 
 
 def test_rows_that_depend_at_a_point_are_no_rows_to_combine_by():

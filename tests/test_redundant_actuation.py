@@ -200,7 +200,7 @@ def test_motors_in_dependent_directions_share_by_least_weighted_norm(name, weigh
     expected = inverse @ E.T @ np.linalg.solve(E @ inverse @ E.T, forces)
     found = np.array([run[motor] for motor in MOTORS[name]])
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-8 * np.abs(expected).max())
-    assert verify(model, run).passed and model.structure().index == 5
+    assert verify(run).passed and model.structure().index == 5
 
 
 def test_laws_share_between_two_motors_as_the_plan_does():
@@ -265,7 +265,7 @@ def test_least_forces_on_a_ring_are_tangential_all_the_way_round():
     along = np.array([-np.sin(at), np.cos(at)])
     force = 2.0 * -0.3 * np.sin(run.t) + 3.0 * np.cos(at)
     assert np.array([run["right"], run["up"]]) == pytest.approx(force * along, abs=1e-9)
-    assert run.counters["pivot_changes"] > 1 and verify(model, run).passed
+    assert run.counters["pivot_changes"] > 1 and verify(run).passed
 
 
 def standing(legs, weights=None):

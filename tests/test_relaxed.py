@@ -90,7 +90,7 @@ def test_the_error_falls_with_the_weight_as_known(front):
 def test_a_plan_is_a_verified_run_of_the_plant(plan, crane):
     plant, _ = crane
     assert plan.success and "X 0.00024" in plan.message
-    verification = sv.verify(plan.model, plan)
+    verification = sv.verify(plan)
     assert verification.passed and any("X is at most 0.00024" in note for note in verification.notes)
     assert plan.residual["X"].shape == (1, len(plan.t))
     X = plan["x"] + 4.0 * np.sin(plan["theta"])
@@ -159,7 +159,7 @@ def test_limits_hold_at_all_instants(crane):
     dense = np.array(u.map(20_001)(np.linspace(0.0, 6.0, 20_001))).ravel()
     assert 110.0 - 1e-3 < np.abs(dense).max() <= 110.0 + 1e-9
     assert np.abs(np.diff(dense)).max() / (6.0 / 20_000) <= 400.0 + 1e-4
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize("bounds, values", [
@@ -191,7 +191,7 @@ def test_a_bound_keeps_the_rope_of_a_flat_crane_taut():
     task = {"start": {"l": 2.0}, "bounds": {"tension": (100.0, None)}, "weight": 2e-8}
     run = sv.inverse(mechanism, program, (0.0, 1.2), **task)
     assert "relaxed, as the exact plan ends: The program is singular at t = 0.2" in run.message
-    assert 95.0 < run["tension"].min() < 101.0 and sv.verify(run.model, run).passed
+    assert 95.0 < run["tension"].min() < 101.0 and sv.verify(run).passed
     Z = run["l"] * np.cos(run["theta"])
     fall = np.gradient(np.gradient(Z, run.t), run.t)[2:-2]
     assert fall.max() < 9.81  # a load on a taut rope falls less than freely
@@ -227,7 +227,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing(plan):
     run = sv.relaxed(sv.plant(absolute), program, (0.0, 6.0), weight=1e-8, start={"Z": -4.0})
     assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
     assert (run["X"] - run["x"]) ** 2 + run["Z"] ** 2 == pytest.approx(16.0, abs=1e-8)
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
     q = sv.coordinates("x theta").with_quasi_velocities("u v", [[1, 0], [-2 * ca.cos(0.3), 1]])
     x, theta = q
@@ -237,7 +237,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing(plan):
     program = sv.Program({"X": load[0] - rest_to_rest(q.t, 0.0, 5.0, 6.0)})
     run = sv.relaxed(sv.plant(other), program, (0.0, 6.0), weight=1e-8)
     assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_a_residual_of_third_order(crane):
@@ -254,7 +254,7 @@ def test_a_residual_of_third_order(crane):
         measured = np.gradient(run["d2x"], run.t)
         target = np.array(ca.Function("j", [q.t], [jerk]).map(len(run.t))(run.t[None])).ravel()
         assert np.percentile(np.abs(measured - target - missed), 95) < 0.01  # the input has corners
-        assert run["x"][-1] == pytest.approx(5.0, abs=1e-9) and sv.verify(run.model, run).passed
+        assert run["x"][-1] == pytest.approx(5.0, abs=1e-9) and sv.verify(run).passed
         largest.append(np.sqrt(np.mean(missed**2)))
     assert largest[1] < largest[0]
 
@@ -339,7 +339,7 @@ def test_the_plant_follows_the_plan(scene):
         again = sv.simulate(run.model, run.start, span, sv.Taylor(rtol=1e-12, atol=1e-14), t_eval=run.t)
         assert np.abs(again.residual[name]).max() < 1e-3 * stroke
     assert np.abs(run.residual[name]).max() < 1e-3 * stroke
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_stiff_machines_are_solved_in_a_few_iterations():
@@ -404,7 +404,7 @@ def test_two_trolleys_with_hoists_carry_a_beam():
     program = sv.Program({"X": X - path[0], "Z": Z - path[1], "phi": phi - path[2], "gap": x2 - x1 - 3.0})
     start = {"x1": -1.5, "x2": 1.5, "X": 0.0, "Z": 5.0, "phi": 0.0}
     run = sv.relaxed(sv.plant(mechanism), program, (0.0, 5.0), weight=1e-10, start=start)
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
     assert max(np.abs(run.residual[name]).max() for name in program.names) < 2e-5
     assert run["hoist1"][0] + run["hoist2"][0] == pytest.approx(-200.0 * 9.81, rel=1e-3)
     again = sv.simulate(run.model, run.start, (0.0, 5.0), sv.Taylor(), t_eval=run.t)
@@ -448,7 +448,7 @@ def test_a_program_of_other_coordinates_is_refused(crane):
 def test_a_span_that_ends_within_a_path_that_is_singular_at_rest(crane):
     """The linearisation at the end is not finite; a plan has an open end."""
     run = sv.relaxed(*crane, (0.0, 3.0), weight=1e-9, end="bounded")
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
     assert np.abs(run.residual["X"][0][run.t < 2.5]).max() < 1e-3  # a layer follows at the open end
 
 

@@ -335,7 +335,7 @@ def test_a_run_backwards_has_the_same_rests():
 def test_a_plant_under_inputs_has_no_verdict():
     plant = sv.plant(crane()[0])
     run = sv.simulate(plant, {"x": 0.0, "theta": 0.1, "dx": 0.0, "dtheta": 0.0}, (0.0, 1.0), inputs={"F": 1.0})
-    report = sv.report(run.model, run)
+    report = sv.report(run)
     assert report.verdict == "inconclusive" and len(repr(report).splitlines()) <= 8
 
 
@@ -377,7 +377,7 @@ def test_directions_without_effect_are_named(gallery_model):
 
 
 def test_the_report_of_a_crane(crane_plan):
-    report = sv.report(crane_plan.model, crane_plan, {"trolley": (-200.0, 140.0)})
+    report = sv.report(crane_plan, limits={"trolley": (-200.0, 140.0)})
     assert (report.verdict, report.index, report.realisation, report.free) == ("flat", 5, "mixed", 0)
     expected = {"order": 0, "raised": 2, "relative degree": 2, "class": 4}
     assert report.residuals == {"X": expected, "Z": expected}
@@ -396,16 +396,16 @@ def test_the_report_of_a_crane(crane_plan):
 def test_rates_are_exact_where_the_run_has_the_jets(crane_plan):
     model = crane_plan.model
     run = sv.simulate(model, crane_plan.start, (0.0, 8.0), sv.Algebraic())
-    sampled = sv.report(model, run).efforts["trolley"]
+    sampled = sv.report(run).efforts["trolley"]
     finer = sv.simulate(model, crane_plan.start, (0.0, 8.0), t_eval=np.linspace(0.0, 8.0, 8001))
-    assert sampled.rate == pytest.approx(sv.report(model, finer).efforts["trolley"].rate, rel=1e-4)
+    assert sampled.rate == pytest.approx(sv.report(finer).efforts["trolley"].rate, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", [*CERTIFIED, "cable-robot", "constant-jerk", "trailers"])
 def test_reports_are_short_and_serve_json(name, gallery_model):
     model = gallery_model(name)
-    for motion in (None, scene_run(name, model)):
-        report = sv.report(model, motion)
+    for what in (model, scene_run(name, model)):
+        report = sv.report(what)
         lines = repr(report).splitlines()
         assert 1 <= len(lines) <= 8 and not any(line.endswith("...") for line in lines)
         assert json.loads(json.dumps(report.as_dict(), allow_nan=False)) == report.as_dict()
@@ -414,8 +414,8 @@ def test_reports_are_short_and_serve_json(name, gallery_model):
 @pytest.mark.parametrize("name", ["vtol-centre", "overhead-crane", "two-cars-ideal"])
 def test_the_figure_of_a_report(name, gallery_model, tmp_path):
     model = gallery_model(name)
-    for motion in (None, scene_run(name, model)):
-        report = sv.report(model, motion)
+    for what in (model, scene_run(name, model)):
+        report = sv.report(what)
         figure = report.plot()
         drawn = [ax for ax in figure.axes if ax.axison]
         assert len(drawn) >= len(report.efforts) and report.verdict in figure.get_suptitle()
@@ -438,9 +438,9 @@ def test_limits_need_a_run_and_an_actuator(crane_plan):
     with refused(sv.SpecificationError, "trolley"):
         sv.report(crane_plan.model, None, {"trolley": 100.0})
     with refused(sv.NameUnknown, match="trolley"):
-        sv.report(crane_plan.model, crane_plan, {"troley": 100.0})
+        sv.report(crane_plan, limits={"troley": 100.0})
     with refused(sv.SpecificationError, name="trolley"):
-        sv.report(crane_plan.model, crane_plan, {"trolley": -1.0})
+        sv.report(crane_plan, limits={"trolley": -1.0})
 
 
 @pytest.mark.parametrize("friction, said", [(0.0, "undamped at rest"), (3.0, "decays with at least 1.5 1/s at rest")])

@@ -69,7 +69,7 @@ def constrained_torques(robot, other, run, k, jacobian, driven):
 def test_a_pose_program_of_six_axes_is_flat_and_verified():
     _, _, model, run = arm_plan()
     assert model.flat
-    assert sv.verify(model, run).verdict == "passed"
+    assert sv.verify(run).verdict == "passed"
 
 
 def test_torques_of_the_arm_equal_pinocchio():
@@ -85,7 +85,7 @@ def test_torques_of_the_arm_equal_pinocchio():
 def test_least_torques_of_a_standing_quadruped_equal_pinocchio():
     robot, mechanism, model, run = quadruped_plan()
     assert len(mechanism.constraints) == 12
-    assert sv.verify(model, run, segments=4).verdict == "passed"
+    assert sv.verify(run, segments=4).verdict == "passed"
     other = robots.Pinocchio(robot, robots.file_of("quadruped"), "free")
     rows = ca.vertcat(*(robot.frame(f"{leg}_foot").jacobian[:3, :] for leg in LEGS))
     jacobian = ca.Function("J", [ca.vertcat(*robot.q)], [ca.densify(rows)])
@@ -118,7 +118,7 @@ def test_a_four_bar_is_closed_in_its_plane():
     model = sv.derive(mechanism, sv.Program({"crank": arm.q["crank_joint"] + 1.0 + 2.0 * s}))
     start = model.start(guess={"crank_joint": -1.0, "coupler_joint": 1.0, "rocker_joint": -1.2})
     run = sv.simulate(model, start, (0.0, 2.0))
-    assert sv.verify(model, run).verdict == "passed"
+    assert sv.verify(run).verdict == "passed"
     other = robots.Pinocchio(arm, robots.file_of("four_bar"), "fixed")
     rows = (ends[0].jacobian - ends[1].jacobian)[[0, 2], :]
     jacobian = ca.Function("J", [ca.vertcat(*arm.q)], [ca.densify(rows)])
@@ -154,7 +154,7 @@ def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
     model = sv.derive(mechanism, sv.Program({"X": point[0] - line[0], "Z": point[1] - line[1]}))
     run = sv.simulate(model, model.start(guess=home), (0.0, 1.5))
     assert model.flat
-    assert sv.verify(model, run).verdict == "passed"
+    assert sv.verify(run).verdict == "passed"
     other = robots.Pinocchio(robot, str(path), "fixed")
     rows = (ends[0].jacobian - ends[1].jacobian)[[0, 2], :]
     jacobian = ca.Function("J", [ca.vertcat(*robot.q)], [ca.densify(rows)])
@@ -248,7 +248,7 @@ def test_an_acrobot_under_a_momentum_program_keeps_it():
     program = sv.programs.momentum("p", mechanism, "elbow", 0.05 * ca.sin(arm.q["elbow"]) + 0.02)
     model = sv.derive(mechanism, sv.Program(program))
     run = sv.simulate(model, model.start(shoulder=0.3, elbow=0.4, dshoulder=0.2), (0.0, 1.0))
-    assert sv.verify(model, run).verdict == "passed"
+    assert sv.verify(run).verdict == "passed"
 
 
 def test_a_free_path_is_kept_at_the_speed_that_forces_give():

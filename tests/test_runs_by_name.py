@@ -38,7 +38,7 @@ def test_a_run_is_loaded_with_its_model(run, tmp_path):
     model = sv.derive(run.model.reduction.mechanism, run.model.reduction.program)  # derived again
     loaded = sv.load(tmp_path / "plan", model=model)
     assert loaded == run and loaded.start == run.start and path.suffix == ".npz"
-    assert sv.verify(model, loaded).passed
+    assert sv.verify(loaded).passed
     plant = sv.plant(model.reduction.mechanism)
     law, other = (sv.lqr(plan, plant, rate=100) for plan in (run, loaded))
     assert np.array_equal(law.schedule, other.schedule)
@@ -109,7 +109,7 @@ def test_outputs_of_any_order_along_a_flat_program(samples, tmp_path):
     expected = {"jerk": X[3], "snap": product(X, Y, 4), "second jerk": Y[3]}
     for name, values in expected.items():
         assert run[name] == pytest.approx(values, abs=1e-11)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     assert sv.load(run.save(tmp_path / "run.npz"))["snap"] == pytest.approx(expected["snap"], abs=1e-11)
 
 

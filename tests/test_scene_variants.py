@@ -54,7 +54,7 @@ def test_trailers_come_to_circles_about_one_centre(radius, speed):
     robot = run["v"][-1] / (cos(bend) * cos(last)) / run["r"][-1]
     assert robot == pytest.approx(np.sign(radius) * sqrt(radius**2 + 2 * 0.8**2), rel=1e-7)
     assert abs(run["steer"][-1]) < 1e-6 and abs(run["drive"][-1]) < 1e-6
-    assert sv.verify(run.model, run).passed
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize(("rate", "x", "y", "dx", "dy"), [(3.0, 0.2, 0.1, 0.3, -0.1), (-5.0, 0.0, 0.0, 0.4, 0.0)])
@@ -96,7 +96,7 @@ def test_an_elastic_link_tends_to_a_clamped_beam():
         model = sv.derive(*elastic_link(n))
         start = model.start(**{f"{d}bend{i}": 0.0 for d in ("", "d") for i in range(1, n + 1)})
         run = sv.simulate(model, start, (0.0, 0.1), t_eval=[0.0, 0.1])
-        poles = sv.internal_dynamics(model, run).eigenvalues[:, 0]
+        poles = sv.internal_dynamics(run).eigenvalues[:, 0]
         errors.append(1 - np.abs(poles.imag).min() / beam)
     assert 0 < errors[1] < 0.06 and errors[1] < errors[0] / 6  # of second order
 

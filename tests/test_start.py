@@ -458,13 +458,13 @@ def test_a_machine_starts_and_moves_as_the_refusal_says(name):
     t = caught.value.details["nearest_time"]
     moving = model.start(t=t, guess={"psi": start["psi"], "delta": start["delta"]})
     run = sv.simulate(model, moving, (t, 0.9 * duration))
-    assert sv.verify(model, run).passed and run["psi"][0] == pytest.approx(start["psi"], abs=1e-3)
+    assert sv.verify(run).passed and run["psi"][0] == pytest.approx(start["psi"], abs=1e-3)
 
 
 def test_the_motion_after_rest_begins_where_the_start_is():
     model = wheels()
     run = sv.simulate(model, model.start(t=0.01), (0.01, 3.9))
-    assert run["psi"][0] == pytest.approx(model.start()["psi"], abs=1e-9) and sv.verify(model, run).passed
+    assert run["psi"][0] == pytest.approx(model.start()["psi"], abs=1e-9) and sv.verify(run).passed
 
 
 @pytest.mark.parametrize("name", ROLLING)
@@ -558,7 +558,7 @@ def test_the_rate_of_the_residual_leads_on_where_the_residual_itself_is_singular
     model = sv.derive(*headed(build(), angle, rate=True))
     run = sv.simulate(model, model.start(), (0.0, 5.0), t_eval=np.linspace(0.0, 5.0, 101))
     assert run[angle] == pytest.approx(np.ravel(cf.rest_to_rest(run.t, 0, 0.0, 1.0, 4.0, 6)), abs=1e-7)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize("curvature", [0.3, -0.1])
@@ -573,7 +573,7 @@ def test_a_constant_curvature_is_programmed_by_its_rate(curvature):
     model = sv.derive(mechanism, sv.Program({"curvature": q.dt(error)} | speed))
     run = sv.simulate(model, model.start(theta1=np.arctan(0.8 * curvature), theta2=0.0), (0.0, 3.0))
     assert np.tan(run["theta1"] - run["theta2"]) / 0.8 == pytest.approx(curvature, abs=1e-12)
-    assert run["theta2"] - run["theta2"][0] == pytest.approx(curvature * run.t, abs=1e-9) and sv.verify(model, run).passed
+    assert run["theta2"] - run["theta2"][0] == pytest.approx(curvature * run.t, abs=1e-9) and sv.verify(run).passed
 
 
 def by_rates(speed=0.0):
@@ -617,7 +617,7 @@ def test_a_program_that_determines_velocities_but_not_all_coordinates_is_integra
     run = sv.simulate(model, model.start(), (0.0, 3.0))
     s = 3 * np.ravel(cf.rest_to_rest(run.t, 0, 0.0, 1.0, 4.0, 6)) + run.t
     assert run["x"] == pytest.approx(s, abs=1e-7) and run["y"] == pytest.approx(s**2 / 3, abs=1e-7)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_a_search_that_ends_where_an_equation_has_no_gradient_says_so():

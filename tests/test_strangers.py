@@ -19,7 +19,7 @@ def planned(machine, guess, duration):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         plan = sv.simulate(model, model.start(guess=guess), (0.0, duration))
-    verified = sv.verify(model, plan)
+    verified = sv.verify(plan)
     assert verified.passed and len(caught) == len(verified.remarks)
     return plan, verified.remarks
 

@@ -321,7 +321,7 @@ def test_a_load_is_judged_where_its_angles_are_regular(chart):
     structure = model.structure()
     assert structure.zeros_at_infinity == (2, 4, 4) and "differs" not in str(structure)
     plan = sv.simulate(model, model.start(), (0.0, 4.0), t_eval=np.linspace(0.0, 4.0, 101))
-    assert sv.verify(model, plan).passed
+    assert sv.verify(plan).passed
 
 
 def test_a_structure_without_all_zeros_at_infinity_says_so(monkeypatch):

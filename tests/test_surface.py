@@ -179,7 +179,7 @@ def test_models_runs_and_verifications_print_in_eight_lines(name, gallery_model)
     scene, model = gallery[name], gallery_model(name)
     start = model.start(**scene.start, guess=scene.guess)
     run = sv.simulate(model, start, (0.0, 0.1), t_eval=[0.0, 0.02, 0.04, 0.06, 0.08, 0.1])
-    assert short(start) and short(run) and short(sv.verify(model, run, segments=1))
+    assert short(start) and short(run) and short(sv.verify(run, segments=1))
     assert short(model) and short(model.structure())
 
 

@@ -364,7 +364,7 @@ def test_angles_count_up_to_whole_turns(name, factor, samples):
         run = sv.simulate(model, start, (0.0, 4.0), method, t_eval=np.linspace(0.0, 4.0, samples))
         exact = np.exp(1j * np.array(angle(run.t[None])).ravel())
         assert np.abs(run["x"] + 1j * run["y"] - exact).max() < 1e-7
-        assert np.abs(run.residual["a"]).max() < 1e-6 and sv.verify(model, run).passed
+        assert np.abs(run.residual["a"]).max() < 1e-6 and sv.verify(run).passed
 
 
 def test_a_difference_of_headings_counts_up_to_whole_turns():
@@ -378,7 +378,7 @@ def test_a_difference_of_headings_counts_up_to_whole_turns():
     model = sv.derive(mechanism, sv.Program(rows))
     run = sv.simulate(model, model.start(guess={"x": 1.0, "u": 2.0}), (0.0, 5.0))
     assert np.abs(run["u"] + 1j * run["v"] - 2 * np.exp(-2j * run.t)).max() < 1e-9
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_angles_that_are_no_summands_remain():
@@ -626,7 +626,7 @@ def test_a_flat_program_whose_acceleration_jumps_goes_on(curve, bend, samples):
     """x = t, so that y'' is the second derivative of the curve, on either side."""
     model, start = flat(lambda t, x, y: {"X": x - t, "Y": y - curve(x - 0.4305)})
     run = sv.simulate(model, start(0.0), (0.0, 1.0), t_eval=np.linspace(0.0, 1.0, samples))
-    assert run["b"] == pytest.approx(2.0 * bend(run.t - 0.4305), abs=1e-9) and sv.verify(model, run).passed
+    assert run["b"] == pytest.approx(2.0 * bend(run.t - 0.4305), abs=1e-9) and sv.verify(run).passed
 
 
 @pytest.mark.parametrize("span", [(0.0, 20.0), (0.0, -20.0)])
@@ -634,7 +634,7 @@ def test_a_flat_angle_turns_round_and_round(span):
     model, start = flat(lambda t, x, y: {"R": x**2 + y**2 - 1, "angle": ca.atan2(y, x) - t})
     run = sv.simulate(model, start(0.0), span)
     assert np.abs(run["x"] - np.cos(run.t)).max() < 1e-12 and np.abs(run["b"] + 2 * np.sin(run.t)).max() < 1e-10
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def rubbed(path):
@@ -650,7 +650,7 @@ def test_dry_friction_along_a_flat_program():
     model = rubbed(lambda t: 1 + ca.sin(t))
     run = sv.simulate(model, model.start(), (0.0, 10.0), t_eval=np.linspace(0.0, 10.0, 777))
     assert run["u"] == pytest.approx(-2 * np.sin(run.t) + 0.3 * np.sign(np.cos(run.t)), abs=1e-9)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize("samples", [15, 1001])
@@ -665,7 +665,7 @@ def test_dry_friction_does_not_act_where_a_flat_program_rests(samples):
     run = sv.simulate(model, model.start(), (0.0, 7.0), t_eval=np.linspace(0.0, 7.0, samples))
     direction = np.where((run.t > 1) & (run.t < 3), 1.0, np.where((run.t > 4) & (run.t < 6), -1.0, 0.0))
     assert run["u"] - 2 * run["d2x"] == pytest.approx(0.3 * direction, abs=1e-12)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def test_a_bead_on_a_spline_of_its_position_has_its_energy():
@@ -680,4 +680,4 @@ def test_a_bead_on_a_spline_of_its_position_has_its_energy():
         run = sv.simulate(model, model.start(x=place, dx=2.0), (0.0, 0.2))
         energy = (run["dx"] ** 2 + run["dy"] ** 2) / 2 + 9.81 * run["y"]
         np.testing.assert_allclose(energy, energy[0], atol=1e-9)
-        assert sv.verify(model, run).passed
+        assert sv.verify(run).passed

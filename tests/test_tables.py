@@ -256,7 +256,7 @@ def test_motions_on_tables_of_data_are_those_on_sums(monkeypatch, method):
     assert data.method == sums.method
     np.testing.assert_allclose(data["theta"], sums["theta"], atol=1e-12)
     np.testing.assert_allclose(data["F"], sums["F"], atol=1e-9)
-    assert sv.verify(data.model, data).passed
+    assert sv.verify(data).passed
 
 
 def test_series_end_where_a_time_law_reaches_the_knots_of_a_table(monkeypatch):
@@ -351,7 +351,7 @@ def test_steps_end_at_knots_without_a_call_for_each(monkeypatch, c_compiler):
     run = sv.simulate(model, start, (0.0, 6.0), "Taylor", t_eval=np.linspace(0.0, 6.0, 61))
     assert np.isin(knots[1:], np.concatenate(ends)).all()
     assert len(ends) <= 1 + run.counters["steps"] // TaylorSteps.most
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 

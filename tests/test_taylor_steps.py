@@ -375,7 +375,7 @@ def test_a_robot_that_turns_at_measured_rates_has_their_integral(samples, span, 
     curve = make_interp_spline(times, rates[:, None], k=5, bc_type=([(3, [0.0]), (4, [0.0])],) * 2)
     angle = curve.antiderivative()
     heading = 0.1 + angle(run.t)[:, 0] - angle(span[0])[0]
-    assert run.status == 0 and sv.verify(model, run).passed
+    assert run.status == 0 and sv.verify(run).passed
     np.testing.assert_allclose(run["theta"], heading, atol=1e-9)
     np.testing.assert_allclose(run["dtheta"], curve(run.t)[:, 0], atol=1e-12)
     np.testing.assert_allclose(run["dx"], np.cos(heading), atol=1e-9)

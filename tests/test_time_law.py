@@ -24,7 +24,7 @@ def test_two_cars_take_the_time_that_their_closed_form_takes(limit):
     assert law.factor == pytest.approx(brentq(lambda s: largest_force(s) - limit, 0.3, 3.0), rel=2e-6)
     assert limit * (1 - 3e-6) < np.abs(law.plan["force"]).max() * 1.0001 and law.binding[0] == "force"
     assert all(abs(value) <= limit for _, value in law.plan.extrema("force"))
-    assert sv.verify(law.plan.model, law.plan).passed
+    assert sv.verify(law.plan).passed
 
 
 def test_slowed_rates_and_curvatures_leave_the_path_where_it_is():

@@ -75,7 +75,7 @@ def test_the_crane_is_faster_than_by_any_polynomial_and_at_a_limit_nearly_throug
     for name, (low, high) in {"trolley": (-300.0, 300.0), "hoist": (-1400.0, 0.0)}.items():
         (_, least), (_, most) = law.plan.extrema(name)
         assert low <= least and most <= high
-    assert sv.verify(law.plan.model, law.plan).passed
+    assert sv.verify(law.plan).passed
     assert np.abs(law.plan["X"] / 5.0 - (4.0 - law.plan["Z"]) / 2.0).max() < 1e-9  # the straight line
     assert law.plan["X"][-1] == pytest.approx(5.0) and abs(law.plan["trolley"][-1]) < 1e-6
 
@@ -87,7 +87,7 @@ def test_a_mass_takes_the_time_of_full_thrust_and_one_interval_of_ramps(path, sp
     least = 2.0 * np.sqrt(3.0 * 2.0 / 4.0)
     assert least < law.plan.t[-1] <= least * (1.0 + 1.1 / INTERVALS)
     assert active(law, {"push": 4.0}) > 0.94
-    assert sv.verify(law.plan.model, law.plan).passed
+    assert sv.verify(law.plan).passed
 
 
 def test_limits_of_rates_give_the_law_of_seven_pieces():
@@ -110,7 +110,7 @@ def test_stable_internal_dynamics_take_part():
     law = sv.fastest(*trailer(), {"push": 60.0}, (0.0, 5.0), shape=True)
     even = sv.fastest(*trailer(), {"push": 60.0}, (0.0, 5.0))
     assert law.plan.t[-1] < 0.8 * even.plan.t[-1] and active(law, {"push": 60.0}) > 0.9
-    assert np.abs(law.plan["push"]).max() <= 60.0 and sv.verify(law.plan.model, law.plan).passed
+    assert np.abs(law.plan["push"]).max() <= 60.0 and sv.verify(law.plan).passed
     assert not law.plan.model.flat and law.plan["y"][-1] != pytest.approx(3.0)
 
 
@@ -130,7 +130,7 @@ def test_a_full_circle_is_followed():
     law = sv.fastest(mechanism, program, {"fx": 3.0, "fy": 3.0}, (0.0, 2.0), shape=True)
     assert np.abs(np.hypot(law.plan["x"], law.plan["y"]) - 1.0).max() < 1e-11
     assert max(np.abs(law.plan[name]).max() for name in ("fx", "fy")) <= 3.0 and active(law, {"fx": 3.0, "fy": 3.0}) > 0.8
-    assert sv.verify(law.plan.model, law.plan).passed
+    assert sv.verify(law.plan).passed
 
 
 def test_what_is_no_curve_is_refused():

@@ -231,9 +231,9 @@ def test_without_pandas_or_xarray_it_says_what_to_do(table, monkeypatch):
 
 def test_values_are_small_tables_in_a_notebook(plan, loop, table):
     model = plan.model
-    verification = sv.verify(model, plan)
+    verification = sv.verify(plan)
     values = [
-        plan, loop, table, model, plan.start, verification, sv.report(model, plan), model.structure(), loop.law, loop.plant,
+        plan, loop, table, model, plan.start, verification, sv.report(plan), model.structure(), loop.law, loop.plant,
         model.reduction.mechanism,
     ]  # fmt: skip
     for value in values:

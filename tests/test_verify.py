@@ -19,10 +19,10 @@ checks = importlib.import_module("servoctl.verification.verify")
 CHANGE = 1.001
 
 
-def verdict(model, run):
+def verdict(run):
     """The verdict, or "refused"."""
     try:
-        return sv.verify(model, run).verdict
+        return sv.verify(run).verdict
     except sv.ServoError:
         return "refused"
 
@@ -156,7 +156,7 @@ RIGHT = {
 def test_what_is_right_passes(name):
     build, method = RIGHT[name]
     model, start, span = build()
-    proof = sv.verify(model, sv.simulate(model, start, span, method))
+    proof = sv.verify(sv.simulate(model, start, span, method))
     assert proof.verdict == "passed" and proof.passed, proof
 
 
@@ -167,7 +167,7 @@ def test_rounding_of_nearly_dependent_rows_excuses_no_other_force(share, by):
     names, forces = run.signals("reaction" if model.ideal else "actuation")
     for name, force in zip(names, forces, strict=True):
         stored = {name: force + 5e-6 * np.abs(forces).max()}
-        assert "acceleration" in sv.verify(model, replace(run, stored=stored)).failures
+        assert "signals" in sv.verify(replace(run, stored=stored)).failures
 
 
 @pytest.mark.parametrize("eps", [0.1, 1e-3])
@@ -179,7 +179,7 @@ def test_a_pivot_may_vanish_at_an_instant_of_the_checks(eps):
     model = sv.derive(mechanism, sv.Program({"p": (x - 20.0) * dy + eps * dz - ca.cos(q.t)}, by="ideal"))
     start = model.start(x=1.0, y=0.0, z=0.0, dx=8.0, dz=0.3)
     run = sv.simulate(model, start, (0.0, 3.0), "DOP853", t_eval=[0.0, 2.3, 2.37, 2.38, 3.0])
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize("samples", [2, 3, 11, 2001])
@@ -188,7 +188,7 @@ def test_the_verdict_does_not_depend_on_the_samples(name, samples, gallery_model
     model, scene = gallery_model(name), gallery[name]
     start, t_eval = model.start(**scene.start, guess=scene.guess), np.linspace(*scene.t_span, samples)
     run = sv.simulate(model, start, scene.t_span, t_eval=t_eval)
-    proof = sv.verify(model, run)
+    proof = sv.verify(run)
     assert proof.passed and {"segments", "energy"} <= set(proof.numbers), proof
 
 
@@ -206,7 +206,7 @@ def test_pivots_that_vanish_between_samples_are_replaced(samples):
     model = sv.derive(mechanism, program, guess={"z": 1.0})
     run = sv.simulate(model, model.start(guess={"z": 1.0}), (0.0, 4.0), t_eval=np.linspace(0.0, 4.0, samples))
     assert len(run.variants) > 3
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 @pytest.mark.parametrize("order", [2, 3, 4])
@@ -222,24 +222,23 @@ def test_a_row_above_the_order_of_the_motion_has_a_residual(order, by):
     run = sv.simulate(model, model.start(z=0.1), (0.0, 2.0))
     assert "s " in repr(run) and np.abs(run.residual["s"]).max() < 1e-9
     assert run["y"] == pytest.approx(0.1 * run.t, abs=1e-9)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     moved = edited(run, jets=scaled(run.jets, 1))
-    assert {"residual s", "residual hidden: s"} & set(sv.verify(model, moved).failures)
+    assert {"residual s", "residual hidden: s"} & set(sv.verify(moved).failures)
 
 
 # what is wrong --------------------------------------------------------------------------------------------------------
 
 
-def test_a_run_of_another_program_or_other_numbers_is_refused():
+def test_a_run_of_another_program_or_other_numbers_fails():
     (model, start, span), (other, *_) = chain(), chain(path=lambda t: 0.5 * ca.sin(2 * t))
     run = sv.simulate(model, start, span)
-    for wrong, changed in ((other, []), *((model.with_parameters(**{n: v}), [n]) for n, v in (("k", 2.1), ("pace", 1.1)))):
-        with refused(sv.SpecificationError, "sv.verify", *changed, parameters=changed):
-            sv.verify(wrong, run)
-        assert verdict(wrong, edited(run, model=wrong)) == "failed"
-        assert verdict(wrong, edited(run, model=wrong, variants=())) == "failed"
-    assert sv.verify(model.with_parameters(k=2.0), run).passed
-    assert sv.verify(chain()[0], pickle.loads(pickle.dumps(run))).passed
+    for wrong in (other, model.with_parameters(k=2.1), model.with_parameters(pace=1.1)):
+        assert verdict(edited(run, model=wrong)) == "failed"
+        assert verdict(edited(run, model=wrong, variants=())) == "failed"
+    for same in (model.with_parameters(k=2.0), chain()[0]):
+        assert sv.verify(replace(run, model=same)).passed
+    assert sv.verify(pickle.loads(pickle.dumps(run))).passed
 
 
 EDITS = {
@@ -261,7 +260,7 @@ def test_changed_samples_fail(name, edit, gallery_model):
         if "time" in edit:
             k = int(np.argmax(np.abs(run.jets[model.nq : model.nq + model.n]).max(axis=0)))
         if run.jets[row].any():
-            assert verdict(model, EDITS[edit](run, row, k)) == "failed", (row, k)
+            assert verdict(EDITS[edit](run, row, k)) == "failed", (row, k)
 
 
 def test_samples_beside_the_program_are_decided_by_few_steps(monkeypatch):
@@ -269,15 +268,15 @@ def test_samples_beside_the_program_are_decided_by_few_steps(monkeypatch):
     (model, start, span), taken, stepped = chain(), [], intervals._stepped
     run = sv.simulate(model, start, span)
     monkeypatch.setattr(intervals, "_stepped", lambda *given: taken.append(stepped(*given)) or taken[-1])
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     least = sum(steps[-1] for steps in taken)
     for wrong in (model.with_parameters(k=2.1), model.with_parameters(pace=1.1), chain(path=lambda t: 0.5 * ca.sin(2 * t))[0]):
         taken.clear()
-        proof = sv.verify(wrong, edited(run, model=wrong))
+        proof = sv.verify(edited(run, model=wrong))
         assert {"segments", "energy"} <= set(proof.failures) and not proof.doubts
         assert sum(steps[-1] for steps in taken) < 10 * least  # twice, as the energy is wrong, too
     for k in (1, 500, 1000):
-        proof = sv.verify(model, edited(run, jets=scaled(run.jets, (0, k)), variants=()))
+        proof = sv.verify(edited(run, jets=scaled(run.jets, (0, k)), variants=()))
         assert any(name.startswith("residual") for name in proof.failures) and not proof.doubts
 
 
@@ -285,14 +284,8 @@ def test_samples_beside_the_program_are_decided_by_few_steps(monkeypatch):
 def test_samples_that_are_no_numbers_fail(which, plan):
     jets = plan.jets.copy()
     jets[which] = np.nan
-    proof = sv.verify(plan.model, edited(plan, jets=jets))
+    proof = sv.verify(edited(plan, jets=jets))
     assert proof.failures == ("samples",) and proof.numbers["samples"] >= 1
-
-
-def test_what_neither_inputs_nor_multipliers_determine_is_inconclusive():
-    model, start, span = leaning(0.0, order=3)
-    proof = sv.verify(model, sv.simulate(model, start, span))
-    assert proof.verdict == "inconclusive" and len(proof.doubts) == 1
 
 
 @pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
@@ -302,23 +295,23 @@ def test_wrong_motions_of_a_singular_mechanism_fail(lean, jet):
     model, start, span = leaning(lean)
     run = sv.simulate(model, start, span)
     wrong = scaled(run.jets, model.jet_names.index(jet))
-    assert "acceleration" in sv.verify(model, edited(run, jets=wrong)).failures
+    assert "balance" in sv.verify(edited(run, jets=wrong)).failures
 
 
 @pytest.mark.parametrize("name", ["trolley", "hoist", "energy"])
 @pytest.mark.parametrize("which", [slice(None), 100])
 def test_changed_forces_fail(name, which, plan):
     values = scaled(plan[name], which)
-    proof = sv.verify(plan.model, edited(plan, stored={name: values}))
-    assert "signals" in proof.failures and ("acceleration" in proof.failures) == (name != "energy")
+    proof = sv.verify(edited(plan, stored={name: values}))
+    assert "signals" in proof.failures and ("balance" in proof.failures) == (name != "energy")
 
 
 def test_changed_rates_of_signals_fail_and_what_the_model_does_not_know_is_a_doubt(wheel):
     run = sv.simulate(*wheel, (0.0, 0.2), sv.Taylor(jets=3), t_eval=np.linspace(0.0, 0.2, 11))
     rate = run["dreaction_x"]
-    assert "dreaction_x" in run.stored and sv.verify(run.model, run).passed
-    assert sv.verify(run.model, edited(run, stored={"dreaction_x": scaled(rate, 3)})).failures == ("signals",)
-    proof = sv.verify(run.model, edited(run, stored={"mine": rate}))
+    assert "dreaction_x" in run.stored and sv.verify(run).passed
+    assert sv.verify(edited(run, stored={"dreaction_x": scaled(rate, 3)})).failures == ("signals",)
+    proof = sv.verify(edited(run, stored={"mine": rate}))
     assert proof.verdict == "inconclusive" and "'mine'" in proof.doubts[0]
 
 
@@ -326,7 +319,7 @@ def test_forces_of_a_mechanism_without_a_coupling_fail():
     (model, start, span), (loose, *_) = chain(2.0), chain(1.9)
     run = sv.simulate(model, start, span)
     forces = replace(run, model=loose, variants=(), stored={})["F"]
-    assert "acceleration" in sv.verify(model, edited(run, stored={"F": forces})).failures
+    assert "balance" in sv.verify(edited(run, stored={"F": forces})).failures
 
 
 def test_the_other_elbow_fails():
@@ -342,12 +335,12 @@ def test_the_other_elbow_fails():
     flipped = np.array([run["a"] + 2 * np.arctan2(np.sin(bend), 1 + np.cos(bend)), -bend])
     y = model.function("path").grid(run.t, flipped, model.parameters)
     other = np.concatenate([flipped, y[2:6]])
-    assert sv.verify(model, run).passed
-    assert sv.verify(model, edited(run, jets=other, variants=())).passed, "a motion of its own"
+    assert sv.verify(run).passed
+    assert sv.verify(edited(run, jets=other, variants=())).passed, "a motion of its own"
     for mixed in ([50], range(50, 101), range(0, 101, 2), [0], [100]):
         jets = run.jets.copy()
         jets[:, list(mixed)] = other[:, list(mixed)]
-        assert "segments" in sv.verify(model, edited(run, jets=jets, variants=())).failures
+        assert "segments" in sv.verify(edited(run, jets=jets, variants=())).failures
 
 
 @pytest.mark.parametrize("samples", [None, 57])
@@ -358,9 +351,9 @@ def test_flat_programs_that_were_integrated_pass(name, samples, gallery_model):
     times = None if samples is None else np.linspace(*scene.t_span, samples)
     start = model.start(**scene.start, guess=scene.guess)
     run = sv.simulate(model, start, scene.t_span, "RK4", t_eval=times)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     name = model.actuators[0]
-    assert "acceleration" in sv.verify(model, edited(run, stored={name: scaled(run[name])})).failures
+    assert "balance" in sv.verify(edited(run, stored={name: scaled(run[name])})).failures
 
 
 # kinks and switches ---------------------------------------------------------------------------------------------------
@@ -392,10 +385,10 @@ def test_runs_across_switches_pass(scene, method, samples, tmp_path):
     model, start, span = scene()
     times = None if samples is None else np.linspace(*span, samples)
     run = sv.simulate(model, start, span, method, t_eval=times)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     again, *_ = scene()
     loaded = sv.load(run.save(tmp_path / "run"), again)
-    assert loaded == run and len(loaded.variants) > 1 and sv.verify(again, loaded).passed
+    assert loaded == run and len(loaded.variants) > 1 and sv.verify(loaded).passed
 
 
 def test_wrong_sides_of_switches_fail():
@@ -403,14 +396,14 @@ def test_wrong_sides_of_switches_fail():
     run = sv.simulate(model, start, span)
     (*_, one), (*_, other) = run.variants[:2]
     swapped = tuple((a, b, other if v is one else one) for a, b, v in run.variants)
-    assert "switches" in sv.verify(model, edited(run, variants=swapped)).failures
+    assert "switches" in sv.verify(edited(run, variants=swapped)).failures
     later = [(0, run.variants[0][1] + 3, one), (run.variants[0][1] + 3, run.variants[1][1], other), *run.variants[2:]]
-    assert "switches" in sv.verify(model, edited(run, variants=tuple(later))).failures
+    assert "switches" in sv.verify(edited(run, variants=tuple(later))).failures
     weak, *_ = rubbed(1.99)
     wrong = sv.simulate(weak, start, span)
-    assert "acceleration" in sv.verify(model, replace(wrong, model=model, variants=run.variants[:0])).failures
+    assert "balance" in sv.verify(replace(wrong, model=model, variants=run.variants[:0])).failures
     for jets in (scaled(run.jets, (slice(None), 500)), scaled(run.jets)):
-        assert not sv.verify(model, edited(run, jets=jets)).passed
+        assert not sv.verify(edited(run, jets=jets)).passed
 
 
 def test_states_between_samples_are_those_of_their_side():
@@ -427,9 +420,9 @@ def test_states_between_samples_are_those_of_their_side():
 def test_changed_jets_of_higher_order_fail():
     model, start, span = chain(by="ideal")
     run = sv.simulate(model, start, span, sv.Taylor(jets=5))
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     for which in (slice(None), 700):
-        assert sv.verify(model, edited(run, jets=scaled(run.jets, (-1, which)))).failures == ("higher jets",)
+        assert sv.verify(edited(run, jets=scaled(run.jets, (-1, which)))).failures == ("higher jets",)
 
 
 @pytest.mark.parametrize("what", ["t", "states", "inputs", "commands", "measurements", "controller_states"])
@@ -455,14 +448,14 @@ def test_changed_signals_of_a_closed_loop_fail(what, plan):
 def test_what_cannot_be_followed_is_inconclusive(c_compiler):
     model, start, _ = chain(1e13, by="ideal")
     run = sv.simulate(model, start, (0.0, 0.02), as_method("RadauIIA"), t_eval=[0.0, 0.01, 0.02])
-    proof = sv.verify(model, run)
+    proof = sv.verify(run)
     assert (proof.verdict, proof.passed, proof.failures) == ("inconclusive", False, ())
     assert "t_eval" in proof.doubts[0] and "Verification: inconclusive" in repr(proof)
 
 
 def test_one_sample_is_inconclusive(plan):
     one = edited(plan, t=plan.t[:1], jets=plan.jets[:, :1], variants=())
-    proof = sv.verify(plan.model, one)
+    proof = sv.verify(one)
     assert proof.verdict == "inconclusive" and "segments" not in proof.numbers
 
 
@@ -483,12 +476,12 @@ MALFORMED = {
 @pytest.mark.parametrize("what", MALFORMED)
 def test_what_is_no_run_of_the_model_is_refused(what, plan):
     with refused(sv.SpecificationError):
-        sv.verify(plan.model, MALFORMED[what](plan))
+        sv.verify(MALFORMED[what](plan))
 
 
 @pytest.mark.parametrize("values", [None, "x", [1.0], 1j, object()])
 def test_stored_signals_that_are_no_samples_fail_or_are_left_out(values, plan):
-    assert verdict(plan.model, edited(plan, stored={"energy": values})) in ("failed", "passed")
+    assert verdict(edited(plan, stored={"energy": values})) in ("failed", "passed")
 
 
 # peaks of power -------------------------------------------------------------------------------------------------------
@@ -507,7 +500,7 @@ def jerky(steepness, at, height=0.01):
 def test_narrow_peaks_of_power_do_not_fail(steepness, at, samples):
     model = jerky(steepness, at)
     run = sv.simulate(model, model.start(), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, samples))
-    found = sv.verify(model, run)
+    found = sv.verify(run)
     assert not found.failures
     assert found.passed or (steepness >= 1000.0 and samples < 1001 and "t_eval" in repr(found))
 
@@ -518,7 +511,7 @@ def test_wrong_forces_at_narrow_peaks_fail(samples):
     run = sv.simulate(model, model.start(), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, samples))
     jets = run.jets.copy()
     jets[0, samples // 2 :] += 1e-4
-    assert sv.verify(model, replace(run, jets=jets)).verdict == "failed"
+    assert sv.verify(replace(run, jets=jets)).verdict == "failed"
 
 
 @pytest.mark.parametrize("name", ["overhead-crane", "appell-hamel", "spiral"])
@@ -529,9 +522,9 @@ def test_sizes_at_some_instants_give_the_same_verdict(name, change, gallery_mode
     jets = run.jets.copy()
     jets[0, 507] += change * np.abs(jets[0]).max()  # between the instants whose sizes are known
     run = edited(run, jets=jets)
-    some = sv.verify(model, run)
+    some = sv.verify(run)
     monkeypatch.setattr(checks, "FEW_SIZES", 10**6)
-    every = sv.verify(model, run)
+    every = sv.verify(run)
     assert (some.verdict, some.failures) == (every.verdict, every.failures)
     assert every.failures or change < 1e-6
     for key, number in every.numbers.items():
@@ -541,7 +534,7 @@ def test_sizes_at_some_instants_give_the_same_verdict(name, change, gallery_mode
 def test_what_is_clear_is_evaluated_once_or_twice_at_a_sample(gallery_model, monkeypatch):
     model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
     run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span)
-    sv.verify(model, run)
+    sv.verify(run)
     points, grid = {}, Compiled.grid
 
     def counted(f, t, x, p):
@@ -549,8 +542,8 @@ def test_what_is_clear_is_evaluated_once_or_twice_at_a_sample(gallery_model, mon
         return grid(f, t, x, p)
 
     monkeypatch.setattr(Compiled, "grid", counted)
-    assert sv.verify(model, run).passed
-    for name in ("residuals", "plant", "multiplier_form", "all_multipliers", "power", "energy"):
+    assert sv.verify(run).passed
+    for name in ("residuals", "balanced", "all_multipliers", "power", "energy"):
         assert points[name] <= 2 * len(run.t), points
 
 
@@ -560,4 +553,4 @@ def test_many_variants_of_one_model_are_followed_together(gallery_model, monkeyp
     cut = edited(run, variants=tuple((k, k + 13, model) for k in range(0, 1001, 13)))
     seen, integrate = [], intervals._integrate
     monkeypatch.setattr(intervals, "_integrate", lambda flow, *rest: seen.append(flow) or integrate(flow, *rest))
-    assert sv.verify(model, cut).passed and len(seen) <= 4
+    assert sv.verify(cut).passed and len(seen) <= 4

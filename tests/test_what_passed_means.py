@@ -71,7 +71,7 @@ def test_a_first_transient_is_named_with_the_start_that_has_none(k, c, M):
     assert start["x"] == pytest.approx(steady, abs=1e-3)
     again, more = warned(model, start, (0.0, 6.0))
     assert more == [] and np.abs(again["drive"]).max() == pytest.approx(peak, rel=1e-3)
-    verification = sv.verify(model, run)
+    verification = sv.verify(run)
     assert verification.passed and verification.remarks[0] == said[0].removesuffix(".")
     assert verification.remarks[0] in repr(verification).splitlines()[1]
 
@@ -133,7 +133,7 @@ def remarks(model, start=None, span=(0.0, 4.0), **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         run = sv.simulate(model, start or model.start(), span, **options)
-    verification = sv.verify(model, run)
+    verification = sv.verify(run)
     assert verification.passed and len(repr(verification).splitlines()) <= 8
     assert all(said in verification.details for said in verification.remarks)
     assert [said for said in verification.remarks if said in repr(verification)] == [*verification.remarks[:1]]

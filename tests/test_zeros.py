@@ -118,7 +118,7 @@ def test_loops_do_not_depend_on_whether_a_number_is_the_default(name):
         mechanism, program = eccentric(e)
         model = sv.derive(mechanism, program).with_parameters(e=0.1)
         plan = sv.simulate(model, model.start(), (0.0, 1.0))
-        assert sv.verify(model, plan).passed
+        assert sv.verify(plan).passed
         plant = sv.plant(mechanism, e=0.1)
         runs.append(sv.close(sv.plant(mechanism, e=0.2), law(plan, plant, rate=100.0), plan.state(0.0), (0.0, 1.0)))
         assert sv.verify(runs[-1]).passed
@@ -197,7 +197,7 @@ def test_a_pivot_that_other_parameters_nearly_cancel_is_chosen_again():
         run = sv.simulate(model, model.start(guess={"x": 0.0, "y": 0.0}), (0.0, 0.5), "DOP853")
         fastest = np.abs(run.jets[4:]).max()  # 8e6 m/s² near t = 0, where rounding of b y'' leaves A'' no smaller
         limits = 1e-12 + np.array([0.0, 0.0, np.finfo(float).eps * 0.01 * fastest])
-        assert sv.verify(model, run).passed and np.all(np.abs(run.residual["A"]).max(axis=1) < limits)
+        assert sv.verify(run).passed and np.all(np.abs(run.residual["A"]).max(axis=1) < limits)
 
 
 def weighted(a=1.0, e=0.0):
@@ -314,7 +314,7 @@ def test_a_force_that_turns_drives_what_it_turns_to(blend):
         rtol=1e-10, atol=1e-12, max_step=0.02,
     )  # fmt: skip
     assert [run["y"][-1], run["dy"][-1]] == pytest.approx(reference.y[:, -1], abs=1e-6)
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
 
 
 def coupled(kind, blend):
@@ -362,7 +362,7 @@ def test_a_motion_ends_where_a_residual_begins_to_hold_velocities():
         sv.simulate(model, model.start(x=1.0, dx=2.5), (0.0, 3.0))
     assert 1.9 < caught.value.run["x"][-1] < 2.1
     slow = sv.simulate(model, model.start(x=1.0, dx=1.0), (0.0, 3.0))  # stays below x = 2
-    assert slow.success and sv.verify(model, slow).passed
+    assert slow.success and sv.verify(slow).passed
 
 
 def test_a_row_that_becomes_nonlinear_in_its_highest_derivative_is_solved_as_such():
@@ -425,7 +425,7 @@ def test_a_flat_plan_presses_on_a_spring_stop(numbers):
     path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=5)
     model = sv.derive(mechanism, sv.Program({"P": b - path}, by="actuators")).with_parameters(**numbers)
     run = sv.simulate(model, model.start(), (0.0, 2.0))
-    assert sv.verify(model, run).passed
+    assert sv.verify(run).passed
     stop = 7 * 20.0 * 0.5**6
     assert run["F"][-1] == pytest.approx(stop, rel=1e-9)  # at rest on the stop: F = V'(b)
     assert run["a"][-1] == pytest.approx(1.0 + stop / 5.0, rel=1e-9)

@@ -48,7 +48,7 @@ model = sv.derive(*{function}({arguments}))
 start = model.start({start})
 """
 GOES_ON = """run = sv.simulate(model, start, {how})
-print(model, run, sv.verify(model, run), sep="\\n")
+print(model, run, sv.verify(run), sep="\\n")
 """
 ENDS = """try:
     sv.simulate(model, start, {how})

@@ -418,7 +418,7 @@ def _require_smooth(plan, orders):
 
 
 def _require_stable(plan):
-    internal = internal_dynamics(plan.model, plan)
+    internal = internal_dynamics(plan)
     if internal.verdict not in ("unstable", "inconclusive"):
         return
     worst, names = float(internal.eigenvalues.real.max(initial=-np.inf)), ", ".join(internal.names)

@@ -301,7 +301,7 @@ def _require_stable(plan):
     """Refuse a plan, if there is one, along which errors of the internal dynamics grow."""
     if plan is None or plan.model.flat:
         return
-    internal = internal_dynamics(plan.model, plan)
+    internal = internal_dynamics(plan)
     if internal.verdict == "unstable":
         raise UnstableInternalDynamics(
             f"Along the curve {internal.sentence()}.",

@@ -280,7 +280,7 @@ class Motions:
         self.guess = dict(zip(model.state_names, np.asarray(first.start.values).tolist(), strict=False))
         if not model.flat and self.method is None:
             _require_no_growth(model, first)
-            free = sensitivity(first.model, first, model.state_names[0], names).independent
+            free = sensitivity(first, model.state_names[0], names).independent
             self.held = {name: self.guess[name] for name in free}
         self.t1 = float(self.ends(self.numbers)[0])
         self.ahead, self.after = self.t0 - float(first.t[0]), float(first.t[-1]) - self.t1
@@ -320,7 +320,7 @@ class Motions:
 
 def _require_no_growth(model, run):
     """Refuse a motion that is integrated forward, along which errors grow."""
-    internal = internal_dynamics(model, run)
+    internal = internal_dynamics(run)
     if internal.verdict == "unstable":
         raise UnstableInternalDynamics(
             f"Along the motion {internal.sentence()}.",
@@ -441,7 +441,7 @@ class Search:
         t, weights = _quadrature([fixed[0], *edges, fixed[-1]], self.panels)
         times, where = np.unique(np.concatenate([fixed, t]), return_inverse=True)
         run = self.motions.run(model, times)
-        tangents = sensitivity(run.model, run, self.signals, self.motions.names)
+        tangents = sensitivity(run, self.signals, self.motions.names)
         y = np.array([run[name] for name in self.signals])
         dy = np.array([[tangents[name, to] for to in self.motions.names] for name in self.signals]).swapaxes(1, 2)
         at, inside = where[: len(fixed)], where[len(fixed) :]
@@ -526,7 +526,7 @@ class Search:
         at_ends = [(name, "lower" if x < 0.5 else "upper") for name, x in zip(values, v, strict=True)
                    if min(x, 1.0 - x) <= ACTIVE]  # fmt: skip
         return Design(
-            values, self.minimise, self.measured(v, plan), before, plan, verify(plan.model, plan),
+            values, self.minimise, self.measured(v, plan), before, plan, verify(plan),
             (*limits, *at_ends), float(self.gain(v)[0]), self.evaluated,
         )  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import field
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from servoctl.model.model import SAMPLED, Model, derive
 from servoctl.model.start import State
 from servoctl.reduction.self_motion import SelfMotion, self_motion
 from servoctl.reduction.structure import Directions, Local, directions, margins
-from servoctl.run import Run, require_model
+from servoctl.run import Run, require_run
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.units import rate_unit
@@ -205,17 +204,17 @@ def _of_directions(found):
 
 
 def report(
-    model: Model | Mechanism, run: Run | State | Program | None = None, limits: Mapping[str, float] | None = None
+    what: Run | Model | Mechanism, start: State | Program | None = None, limits: Mapping[str, float] | None = None
 ) -> Report:
     """What a program asks of its mechanism, and the verdict: which inverse it has.
 
     Parameters
     ----------
-    model : Model or Mechanism
-        Of a mechanism and its program the model is derived; where no actuation realises it, the report says so.
-    run : Run, State or Program, optional
-        A run, along which ranks, growth and actuation are reported; or a start; or the program of a mechanism. Default:
-        the start near the guess of `derive`.
+    what : Run, Model or Mechanism
+        A run, along which ranks, growth and actuation are reported; or a model; or a mechanism, of whose program the
+        model is derived; where no actuation realises it, the report says so.
+    start : State or Program, optional
+        Of a model, by default the one near the guess of `derive`; or the program of a mechanism.
     limits : dict of str to float or (float, float), optional
         Limits of actuators, as in `plant`: c means (-c, c).
 
@@ -226,21 +225,21 @@ def report(
     Raises
     ------
     SpecificationError
-        If the run is not of this model, there are limits without a run, or a limit is no interval.
+        If a run has no model, there are limits without a run, or a limit is no interval.
     NameUnknown
         For a limit of no actuator.
     """
-    if isinstance(model, Mechanism):
+    if isinstance(what, Mechanism):
         try:
-            model, run = derive(model, run), None
+            what, start = derive(what, start), None
         except NotRealisable as error:
-            return _not_realisable(model, run, error)
-    model = _require_motion(model, run)
+            return _not_realisable(what, start, error)
+    model, motion = _model_and_motion(what, start)
     limits = by_name(limits, model.actuators, "actuator", "The limits")
     limits = {name: interval(name, value, "limit") for name, value in limits.items()}
-    along = run if isinstance(run, Run) else None
+    along = motion if isinstance(motion, Run) else None
     _require_limits(along, limits)
-    judged, structure, ends = verdict(model, run), model.structure(), endpoints(model, run)
+    judged, structure, ends = verdict(model, motion), model.structure(), endpoints(model, motion)
     margin, ranks = _ranks(model, structure, along, ends)
     return Report(
         judged,
@@ -268,18 +267,21 @@ def _not_realisable(mechanism, program, error):
     return Report(Verdict(UNREALISABLE, str(error).rstrip(".")), facts)
 
 
-def _require_motion(model, run):
-    """The model of a motion; refuse what is no model, and a motion of another one."""
-    if not isinstance(model, Model) or not (run is None or isinstance(run, (Run, State))):
-        raise SpecificationError(
-            f"sv.report received a {type(model).__name__} and a {type(run).__name__}.",
-            "It takes a model, and a run or a start of it; or a mechanism and its program.",
-            do="Write sv.report(model, run), or sv.report(mechanism, program).",
-            model=type(model).__name__,
-            run=type(run).__name__,
-        )
-    motion = run if isinstance(run, Run) else SimpleNamespace(model=model, jets=(), jet_names=getattr(run, "names", ()))
-    return model if run is None else require_model(model, motion, "report")
+def _model_and_motion(what, start):
+    """A model and its motion: a run, a start, or None; others are refused."""
+    if isinstance(what, Model) and isinstance(start, State):
+        whole = what.including(start.names)
+        if whole.state_names == start.names:
+            return whole, start
+    elif start is None:
+        return (what, None) if isinstance(what, Model) else (require_run(what, "report"), what)
+    raise SpecificationError(
+        f"sv.report received a {type(what).__name__} and a {type(start).__name__}.",
+        "It takes a run, a model and a start of it, or a mechanism and its program.",
+        do="Write sv.report(run), sv.report(model, start), or sv.report(mechanism, program).",
+        what=type(what).__name__,
+        start=type(start).__name__,
+    )
 
 
 def _require_limits(run, limits):

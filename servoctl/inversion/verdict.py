@@ -148,7 +148,7 @@ def _of_motion(model, motion):
     switch = next(filter(None, (kink(model, end.t, end.x) for end in rest.values())), "")
     if switch:
         return _on_switch(model, motion, f"the rest lies on a switch, {switch}, and has no linearisation")
-    internal = internal_dynamics(model, motion) if isinstance(motion, Run) else None
+    internal = internal_dynamics(motion) if isinstance(motion, Run) else None
     lost = "" if rest or internal else _lost_at_default_start(model, states[0][0])
     return Verdict(SINGULAR, lost) if lost else _judged(rest, internal, why)
 
@@ -272,7 +272,7 @@ def _on_switch(model, motion, why):
         return Verdict(OPEN, why, f"pass a run that leaves it, along which errors are measured, or {SMOOTHER}")
     if stays_on_kink(model, motion):
         return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin off it")
-    internal = internal_dynamics(model, motion)
+    internal = internal_dynamics(motion)
     return _along(internal, why, {"internal": internal})
 
 

@@ -1,6 +1,6 @@
 """The functions of a motion as SX expressions, each built at its first use."""
 
-from functools import cached_property
+from functools import cached_property, reduce
 
 import casadi as ca
 import numpy as np
@@ -8,7 +8,6 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model import saddle
-from servoctl.reduction.appell import plant_accelerations
 from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate, noting_dropped
 from servoctl.reduction.rows import row_levels
@@ -330,32 +329,26 @@ class Equations(Invariants):
         """L and Bᵀ."""
         return ca.vertcat(*(row.gradient(self.q) for row in monitored_rows(self.r))), self.r.realisation.B.T
 
-    def plant(self):
-        """(q', γ'') of the full mechanism as a function of (t, [q; γ'; inputs of the program])."""
-        r, q = self.r, self.q
-        mechanism, acceleration = r.mechanism, q.jet(2)
-        zero = ca.SX.zeros(q.n)
-        inputs = ca.SX.sym("input", r.actuation.shape[0])
-        driven = mechanism.E @ inputs if r.program.by == "actuators" else inputs
-        material = [row for row in r.original.values() if row.kind == "material"]
-        second = [level[-1] for level in row_levels(q, material, 2)]
-        second = ca.substitute(ca.vertcat(*second), acceleration, zero) if material else ca.SX(0, 1)
-        force = driven - ca.substitute(mechanism.balance, acceleration, zero)
-        solution, _ = plant_accelerations(mechanism, material, force, -second, r.points)
-        x = ca.vertcat(*q, *q.gamma(1), inputs)
-        return self.function("plant", x, [q.V @ q.jet(1) + q.h, solution])
+    def balanced(self):
+        """The mechanism's balance less inputs and material reactions, of (t, [Z; inputs; multipliers]), and its sizes.
 
-    def multiplier_form(self):
-        """Matrix and right side, column by column, of [M -B; C 0] [γ''; μ]: the form with multipliers."""
+        Three numbers a row: what is left, the largest term, and the sum of all terms, multiplied out.
+        """
         r, q = self.r, self.q
-        acceleration, zero = q.jet(2), ca.SX.zeros(q.n)
-        rows = [row for row in r.original.values() if row.order <= 1 or (row.order == 2 and row.affine)]
-        second = ca.vertcat(*(level[-1] for level in row_levels(q, rows, 2)))
-        B = r.realisation.B
-        C = ca.jacobian(second, acceleration) if rows else ca.SX(0, q.n)
-        matrix = ca.vertcat(ca.horzcat(r.mechanism.mass, -B), ca.horzcat(C, ca.SX.zeros(len(rows), B.shape[1])))
-        right = -ca.substitute(ca.vertcat(r.balance, second), acceleration, zero)
-        return self.function("multiplier_form", self.jets, [right, ca.vec(ca.densify(matrix))])
+        mechanism, acceleration, k = r.mechanism, q.jet(2), len(r.program.residuals)
+        by_actuators, B = r.program.by == "actuators", r.realisation.B
+        counts = {"input": r.actuation.shape[0], "multiplier": k, "reaction": B.shape[1] - k}
+        inputs, wanted, reactions = (ca.SX.sym(name, count) for name, count in counts.items())
+        E = mechanism.E if by_actuators else ca.SX.eye(q.n)
+        of_program = E @ r.realisation.actuation if by_actuators else B[:, :k]
+        columns = ca.horzcat(mechanism.mass, -E, -B[:, k:])
+        values = ca.vertcat(acceleration, inputs, reactions)
+        still = ca.substitute(mechanism.balance, acceleration, ca.SX.zeros(q.n))
+        left = still + columns @ values
+        terms = [still, *(columns[:, j] * values[j] for j in range(columns.shape[1]))]
+        sums = ca.vertcat(*map(size_of_terms, left.elements())) + ca.fabs(of_program) @ ca.fabs(wanted)
+        largest = reduce(ca.fmax, map(ca.fabs, terms))
+        return self.function("balanced", ca.vertcat(self.jets, inputs, wanted, reactions), [left, largest, sums])
 
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
@@ -404,25 +397,18 @@ class Equations(Invariants):
         """Inputs of the plant: the actuation, or the reaction of an ideal program."""
         return ["inputs"], [self.r.actuation]
 
-    def _input_terms(self):
-        """The sizes of the terms of these inputs."""
-        return ["input_terms"], [size_of_terms(e) for e in self.r.actuation.elements()]
-
     def _all_multipliers(self):
         """All multipliers μ of the reaction B μ."""
         return ["all_multipliers"], [self.r.multipliers]
 
     def _power(self):
-        """dE/dt, the power of forces without a potential, the size of its terms, the part of dE/dt by explicit time."""
+        """dE/dt, the power of forces without a potential, its terms, what of dE/dt no force does, the terms of E."""
         r, q = self.r, self.q
         w, force = q.jet(1), self._force()
         rate = q.dt(r.mechanism.energy)
         law = rate - ca.dot(w, r.mechanism.balance + r.mechanism.forces)
-        return ["rate", "work", "size", "law"], [rate, ca.dot(w, force), ca.dot(ca.fabs(w), ca.fabs(force)), law]
-
-    def _power_terms(self):
-        """The size of the terms of the power of forces without a potential."""
-        return ["power_terms"], [size_of_terms(ca.dot(self.q.jet(1), self._force()))]
+        sums = ca.dot(ca.fabs(w), ca.fabs(force)), size_of_terms(r.mechanism.energy)
+        return ["rate", "work", "size", "law", "terms"], [rate, ca.dot(w, force), sums[0], law, sums[1]]
 
     def _force(self):
         """Forces without a potential, inputs and reactions, (n,) SX."""
@@ -487,8 +473,7 @@ EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "path": lambda e: (e.path(), ("newton",), None, None, {"pivots": len(e.pivots)}),
     "invariants": lambda e: (e.invariants(),),
     "matrices": lambda e: (e.matrices(),),
-    "plant": lambda e: (e.plant(),),
-    "multiplier_form": lambda e: (e.multiplier_form(),),
+    "balanced": lambda e: (e.balanced(),),
     "accelerations": lambda e: (saddle.accelerations(e),),
 }
 
@@ -504,10 +489,8 @@ SIGNALS = {  # names and expressions of each group
     "coordinate_rates": Equations._coordinate_rates,
     "residuals": Equations._residuals,
     "inputs": Equations._inputs,
-    "input_terms": Equations._input_terms,
     "all_multipliers": Equations._all_multipliers,
     "power": Equations._power,
-    "power_terms": Equations._power_terms,
     "reach": Equations._reach,
 }
 

@@ -491,7 +491,7 @@ class Model(Detailed):
         ----------
         name : str
             "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants",
-            "matrices", "plant", "multiplier_form", or "accelerations".
+            "matrices", "balanced", or "accelerations".
 
         Returns
         -------
@@ -608,25 +608,6 @@ class Model(Detailed):
     def invariant_names(self):
         """(level, name) of each invariant of the state, in the order of the function "invariants"."""
         return self.once("invariant names", lambda: [(level, name) for level, name, _ in self.equations.invariant_rows])
-
-    def multiplier_form(self, t, jets):
-        """Matrices [M -B; C 0] and right sides of the equations with multipliers.
-
-        Parameters
-        ----------
-        t : (N,) array
-            [s]
-        jets : (n_z, N) array
-
-        Returns
-        -------
-        matrix : (rows, columns, N) array
-        right : (rows, N) array
-        """
-        y = self.function("multiplier_form").grid(t, jets, self.parameters)
-        columns = self.n + self.reduction.realisation.B.shape[1]
-        rows = len(y) // (columns + 1)
-        return y[rows:].reshape(columns, rows, -1).swapaxes(0, 1), y[:rows]
 
     @cached_property
     def row_pivots(self):

@@ -12,9 +12,8 @@ from servoctl.markup import Shown
 from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
-from servoctl.model.model import Model
 from servoctl.model.switching import switching
-from servoctl.run import STENCIL, ByName, Run, require_model
+from servoctl.run import STENCIL, ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
 from servoctl.sensitivities.tangent import along_state, determined, invariants_by, start_of, variational
 from servoctl.values import Value, frozen
@@ -145,7 +144,7 @@ def _growth_in_words(number):
 
 
 def sensitivity(
-    model: Model, run: Run, of: str | Sequence[str] | None = None, to: str | Sequence[str] | None = None
+    run: Run, of: str | Sequence[str] | None = None, to: str | Sequence[str] | None = None
 ) -> Sensitivity:
     """Derivatives of a run's signals by parameters and initial values, without differences.
 
@@ -154,9 +153,7 @@ def sensitivity(
 
     Parameters
     ----------
-    model : Model
     run : Run
-        A motion of it.
     of : str or sequence of str, optional
         Names of signals: coordinates, their derivatives up to γ^(s̄), actuation, outputs, multipliers. Default: the
         actuation, or the reaction of an ideal program.
@@ -170,10 +167,10 @@ def sensitivity(
     Raises
     ------
     NameUnknown
-        For a name that model or run do not have.
+        For a name that the run does not have.
     SpecificationError
-        If the run is not of this model and its numbers, an initial value follows from the others, or the motion
-        crosses kinks or switches of the state.
+        If the run has no model, an initial value follows from the others, or the motion crosses kinks or switches of
+        the state.
     IntegrationStopped
         If the variational equation cannot be integrated along the run.
 
@@ -182,8 +179,8 @@ def sensitivity(
     Initial values that the constraints determine change with the others. Those that `model.start` held are constant
     where they are not differentiated by.
     """
-    model = require_model(model, run, "sensitivity")
-    _require_run(model, run)
+    model = require_run(run, "sensitivity")
+    _require_smooth(model)
     default = [name for name, kind in model.signal_groups.items() if kind in ("actuation", "reaction")]
     of = tuple(dict.fromkeys(default if of is None else texts(of, "The names of signals")))
     to = tuple(dict.fromkeys(list(model.numbers) if to is None else texts(to, "The names of parameters")))
@@ -215,27 +212,13 @@ def sensitivity(
     return Sensitivity(run, of, to, values, independent)
 
 
-def _require_run(model, run):
-    """Refuse a run with other numbers or of another program, and one with switches of the state."""
-    switches = switching(model) is not None
-    programs = [tuple(one.reduction.program.residuals) for one in (model, run.model)]
-    if not switches and programs[0] != programs[1]:
-        names, other = (", ".join(names) or "no program" for names in programs)
+def _require_smooth(model):
+    """Refuse a motion with switches of the state."""
+    if switching(model) is not None:
         raise SpecificationError(
-            f"The model is of {names}, the run of {other}.",
-            "Derivatives are those of the motion that the model determines.",
-            do="Pass run.model: a relaxed plan is a motion of the plant under inputs, which are then held.",
-            model=programs[0],
-            run=programs[1],
-        )
-    if switches or run.model.numbers != model.numbers:
-        smooth = "Smooth the switch, such as tanh(v/v0) for sign(v)."
-        raise SpecificationError(
-            "The motion has kinks or switches of the state." if switches else "The run is of other parameters.",
+            "The motion has kinks or switches of the state.",
             "Derivatives are those along one smooth motion of the model.",
-            do=smooth if switches else "Pass run.model, or simulate again.",
-            run=run.model.numbers,
-            model=model.numbers,
+            do="Smooth the switch, such as tanh(v/v0) for sign(v).",
         )
 
 

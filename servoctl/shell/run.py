@@ -183,7 +183,7 @@ def _verify(run, report):
         report.say("Verification: left out, as the motion ended early.")
         return None
     try:
-        verification = sv.verify(run.model, run)
+        verification = sv.verify(run)
     except (ServoError, KeyboardInterrupt) as error:
         report.say(f"Verification: {str(error) or 'interrupted'}")
         return None

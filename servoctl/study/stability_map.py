@@ -226,7 +226,7 @@ def stability(model: Model, run: Run, order: int = 12) -> StabilityMap:
         raise SpecificationError(
             f"The Jacobian of the motion is finite at {len(t)} instants of the run.",
             "The linearised motion is needed at two instants or more.",
-            do="Check the run by verify(model, run).",
+            do="Check the run by verify(run).",
             instants=len(t),
         )
     return StabilityMap(t, np.linalg.eigvals(matrices).astype(complex), model, order)

@@ -400,7 +400,7 @@ def _errors_and_cost(comparison, motion, method, treatment, value, seconds):
 def _errors(comparison, motion, runs):
     """Errors of a motion at the instants of the comparison: of its samples, and of those between them."""
     run, exact, own = runs[0], comparison.exact, motion.at(comparison.times)
-    rate, work, size, law = run.signals("power")[1]
+    rate, work, size, law, _ = run.signals("power")[1]
     largest = max(np.abs(size).max(), np.abs(rate).max(), 1e-300)
     lawful = np.abs(law).max() < 1e-9 * largest
     energy, own_energy = run["energy"], own["energy"]

@@ -12,11 +12,9 @@ CHECK = ("check, relative", "value", "limit", "", "")
 WORDS = {
     "samples": "samples that are not finite or out of order",
     "signals": "stored signals against those of the samples",
-    "acceleration": "accelerations of the full mechanism under the actuation",
+    "balance": "balance of the full mechanism under the actuation",
     "segments": "states after the motion was integrated from each sample to the next",
-    "power": "power balance dE/dt = sum of force times velocity",
     "energy": "energy against the integrated power",
-    "multiplier form": "residual of the equations with Lagrange multipliers",
     "higher jets": "jets above the order of the model",
     "switches": "states beyond the switches of their sides",
     "outside": "part of the ideal reaction outside the actuators' reach",
@@ -43,10 +41,9 @@ class Verification(Detailed):
     numbers : dict of str to float
         "samples": number of samples that are not finite or out of order;
         "signals": largest difference of a stored signal from its value at the samples, relative to its size;
-        "acceleration": largest error of γ'' of the mechanism under the actuation;
+        "balance": what the run's accelerations and actuation leave of the mechanism's balance, relative to its terms;
         "segments": largest difference of the state from the one integrated from the sample before;
-        "power": largest error of dE/dt = Σ force·velocity; "energy": of its integral;
-        "multiplier form": largest residual of the equations with multipliers, relative to their terms;
+        "energy": largest difference of the energy gained from the work of all forces;
         "higher jets": largest error of jets above the order of the model, relative to their sizes;
         "switches": largest relative change of a state that leads it back to its side of kinks and switches;
         "outside": part of an ideal reaction that the mechanism's actuators cannot exert;

@@ -16,7 +16,7 @@ from servoctl.model.model import Model
 from servoctl.model.store import fingerprint
 from servoctl.model.switching import switching
 from servoctl.progress import stage
-from servoctl.run import SAME_TIME, Run, on_side, require_model, sides
+from servoctl.run import SAME_TIME, Run, on_side, require_run, sides
 from servoctl.values import frozen
 from servoctl.verification.between import AGREES, ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
 from servoctl.verification.loop import verify_loop
@@ -26,50 +26,43 @@ from servoctl.verification.result import Verification, judged, largest, numbers
 LIMITS = {
     "samples": 0.0,
     "signals": 1e-9,
-    "acceleration": 1e-9,
+    "balance": 1e-9,
     "segments": 1e-6,
-    "power": 1e-8,
     "energy": 1e-5,
-    "multiplier form": 1e-9,
     "higher jets": 1e-6,
     "residual": 1e-6,
     "switches": 1e-6,
 }
-INTEGRATED = 1e-6  # limit for numbers that drift disturbs: γ'' is integrated itself, or rows are hidden
-ROUNDING = 1e-13  # relative change of states and inputs whose effect is rounding: some hundred roundings
+INTEGRATED = 1e-6  # limit for the balance that drift disturbs: γ'' is integrated itself, or rows are hidden
+ROUNDING = 1e-13  # part of the sum of all terms, multiplied out, that is rounding: some hundred roundings
 PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and in how many directions
 FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
-BLUNT = 1e-3  # effect of rounding, relative to the accelerations, above which these decide nothing
 OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
 AT_PIVOT_ZERO = 1e-6  # of the least singular value of B: below it B_D is singular, and inputs have no digits
-BALANCED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
-BY_INPUTS = 1e-6  # part of the accelerations, or of the power, that rounding of the inputs may excuse
-FEW_SIZES = 20  # instants that give the sizes of residuals that are far below their limit
+CONSERVED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
+FEW_SIZES = 20  # instants at which the sizes of residuals are measured
 MOST_SEGMENTS = 10_000  # steps along the run that are accepted: seconds
 MOST_OWN_PIVOTS = 3  # choices of pivots of its own, where those of the run vanish between samples
-MOST_ENTRIES = 2e6  # of matrices that are held at once
 
 
 @stage("verifying")
-def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) -> Verification:
+def verify(run: Run | Closed, segments: int = 20) -> Verification:
     """Check a run against the full mechanism, not the reduced model.
 
-    At every sample, and at instants between samples, the mechanism's accelerations under the required actuation are
-    compared with the run's; residuals are evaluated at every level, dE/dt is compared with the power of all forces, and
-    (3.18) with the form that has multipliers. From each sample to the next the motion is integrated again, by steps
-    as short as it requires, so that the verdict does not depend on the distance of the samples.
+    At every sample, and at instants between samples, the mechanism's balance must hold for the run's accelerations
+    under its actuation, and the residuals must vanish at every level. From each sample to the next the motion is
+    integrated again, by steps as short as it requires, so that the verdict does not depend on the distance of the
+    samples, and the energy gained is compared with the work done.
 
-    An error is relative to the sizes of the terms that it is a sum of. It also passes if it is no larger than what
-    rounding of the state and of the inputs causes.
+    An error is relative to the sizes of the terms that it is a sum of, in which rounding is allowed for.
 
-    A closed loop is verified by `verify(closed)`: it is run again and all its signals are compared; its energy against
-    the work of inputs, disturbances and friction, with two lengths of step; material constraints; limits.
+    A closed loop is run again and all its signals are compared; its energy against the work of inputs, disturbances
+    and friction, with two lengths of step; material constraints; limits.
 
     Parameters
     ----------
-    model : Model or Closed
-    run : Run
-        Of this model; omitted for a closed loop.
+    run : Run or Closed
+        A run that was loaded from a file needs its model: `load(path, model)`.
     segments : int
         Number of steps along the run, from 1 to 10,000; each interval between samples has at least one.
 
@@ -81,21 +74,20 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
     Raises
     ------
     SpecificationError
-        If the run is not of this model, or segments is not a whole number from 1 to 10,000.
+        If the run has no model, or segments is not a whole number from 1 to 10,000.
     """
     segments = whole("segments", segments, least=1, most=MOST_SEGMENTS)
-    if run is None and isinstance(model, Closed):
-        found = verify_loop(model)
-        return found if found.failures else replace(found, remarks=of_loop(model))
-    model, run, faulty = _required(model, run)
+    if isinstance(run, Closed):
+        found = verify_loop(run)
+        return found if found.failures else replace(found, remarks=of_loop(run))
+    run, faulty = _required(run)
     if faulty or not len(run.t):
         return judged({"samples": float(faulty or 1)}, {"samples": LIMITS["samples"]})
-    checks = _Checks(model, run, segments)
+    checks = _Checks(run, segments)
     found = {
         **checks.signals(),
-        "acceleration": checks.acceleration(),
-        **checks.balance(),
-        "multiplier form": checks.multiplier_form(),
+        "balance": checks.balance(),
+        **checks.energy(),
         **checks.higher_jets(),
         **checks.outside(),
         **checks.switches(),
@@ -110,15 +102,12 @@ def verify(model: Model | Closed, run: Run | None = None, segments: int = 20) ->
 # --- what is verified
 
 
-def _required(model, run):
-    """The model, its run as far as samples are finite, and the number of faulty samples.
+def _required(run):
+    """The run as far as samples are finite, and the number of faulty samples.
 
     A motion that stopped may end in samples without accelerations.
     """
-    whose = getattr(run, "model", None)
-    whole_run = isinstance(run, Run) and isinstance(whose, Model) and isinstance(run.jet_names, tuple)
-    model = require_model(model if isinstance(model, Model) else None, run if whole_run else None, "verify")
-    _require_same(model, run.model)
+    model = require_run(run, "verify")
     t, jets, knots = numbers(run.t, 1), numbers(run.jets, 2), numbers(run.knots, 1)
     least, mappings = len(model.jet_names), (run.stored, run.stored_residual)
     whole_levels = jets is not None and len(jets) >= least and (len(jets) - least) % model.n == 0
@@ -134,7 +123,7 @@ def _required(model, run):
     faulty = int(np.sum(~good[:count]) + np.sum((steps >= 0) if backwards else (steps <= 0)))
     parts = {"variants": _variants(model, run, count), "knots": tuple(knots)}
     parts["stored"] = {name: np.asarray(values)[:count] for name, values in run.stored.items() if np.ndim(values)}
-    return model, replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
+    return replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
 
 
 def _malformed(least, n, **shapes):
@@ -177,22 +166,6 @@ def _same_or_smooth(model, variant):
     return False
 
 
-def _require_same(model, other):
-    """Refuse a run whose model has other equations or parameters."""
-    if _same(model, other):
-        return
-    names = model.reduction.mechanism.parameters.names
-    pairs = zip(names, model.parameters, other.parameters, strict=False)
-    changed = [name for name, a, b in pairs if a != b]
-    which = f"other numbers of {', '.join(changed)}" if changed else "another mechanism or program"
-    raise SpecificationError(
-        f"sv.verify received a run of a model with {which}.",
-        "A run is verified against the model that it was simulated with.",
-        do="Pass run.model, or simulate this model.",
-        parameters=changed,
-    )
-
-
 @frozen
 class _Instants:
     """Instants at which one variant of the model is evaluated: times (N,), jets (n_z, N) and inputs (m, N).
@@ -214,7 +187,8 @@ class _Instants:
 class _Checks:
     """The checks of one run; `notes` and `doubts` collect what does not apply and what cannot be decided."""
 
-    def __init__(self, model, run, segments):
+    def __init__(self, run, segments):
+        model = run.model
         self.model, self.run, self.notes, self.doubts = model, run, [], []
         hidden = bool(model.reduction.hidden) and run.method != "algebraic"
         of_series = run.method == "Taylor" and len(run.jets) > len(model.jet_names)
@@ -229,7 +203,10 @@ class _Checks:
         self.family = switching(model) if switched else None
         self.mass = self._mass()
         self.sizes = self._sizes(self.samples)
-        self.balanced = self._balanced()
+        self.powers = np.concatenate([at.signals("power") for at in self.samples], axis=1)
+        rate, _, size, law, _ = np.abs(self.powers)
+        inertial = self.mass * self.sizes[model.nq :][: model.n] * self.sizes[model.nq + model.n :][: model.n]
+        self.balanced = not np.any(law > CONSERVED * max(rate.max(), size.max(), inertial.max()))
         self.between, self.sampled, own, self.integrated = self._integrate(segments)
         self.instants = [*self.samples, *own]
         self.sizes = self._sizes(self.instants)
@@ -238,8 +215,7 @@ class _Checks:
 
     def limit(self, key):
         """The limit of a number."""
-        drifts = self.drifts and key in ("acceleration", "power", "multiplier form")
-        return INTEGRATED if drifts else LIMITS.get(key, np.inf)
+        return INTEGRATED if self.drifts and key == "balance" else LIMITS.get(key, np.inf)
 
     def _inputs(self):
         """The actuation, or the reaction of an ideal program, as the run gives it, by variant."""
@@ -253,12 +229,10 @@ class _Checks:
 
     def _mass(self):
         """The largest inertia of each velocity along the run, (n,) array."""
-        model, few = self.samples[0].model, np.unique(np.linspace(0, len(self.samples[0].t) - 1, 16).astype(int))
-        matrices, _ = model.multiplier_form(*self._at(self.samples[0], few))
-        return np.abs(np.einsum("iik->ik", matrices[: model.n, : model.n])).max(axis=1)
-
-    def _at(self, instants, which):
-        return instants.t[which], instants.z[: len(self.model.jet_names), which]
+        first, f = self.samples[0], self.samples[0].model.function("matrices")
+        few = np.unique(np.linspace(0, len(first.t) - 1, 16).astype(int))
+        values = f.grid(first.t[few], first.z[: f.n_x, few], first.model.parameters)
+        return np.abs(values[-self.model.n :]).max(axis=1)
 
     def _sizes(self, instants):
         """The size of each jet (n_z,): its largest value, at least FLOOR of what others of its level have.
@@ -291,10 +265,6 @@ class _Checks:
         with np.errstate(all="ignore"):
             changes = [np.nan_to_num(f(t, x + PROBE * d * steps) - y) / PROBE for d in directions]
         return np.sqrt(np.mean(np.square(changes), axis=0))
-
-    def _rounding(self, f, t, x, y):
-        """Effect of rounding of x on f(t, x) = y."""
-        return ROUNDING * self._response(f, t, x, y, np.abs(x))
 
     # between samples
 
@@ -413,111 +383,14 @@ class _Checks:
 
     # the equations
 
-    def acceleration(self):
-        """Largest error of the mechanism's γ'' under the inputs, relative to what has as large an energy."""
-        n, nq = self.model.n, self.model.nq
-        worst, blunt, limit = 0.0, 0.0, self.limit("acceleration")
-        size = self._alike(self.sizes[nq + n : nq + 2 * n])[:, None]
+    def balance(self):
+        """Largest part of the mechanism's balance that the run's inputs leave, relative to the terms of each row."""
+        n, n_z, limit, parts = self.model.n, len(self.model.jet_names), self.limit("balance"), []
         for at in self.instants:
-
-            def f(t, x, model=at.model):
-                return model.function("plant").grid(t, x, model.parameters)[nq:]
-
-            def given(t, z, f=f, at=at):
-                inputs = at.model.signals("inputs")[1]
-                return f(t, np.vstack([z[: nq + n], inputs.grid(t, z[: inputs.n_x], at.model.parameters)]))
-
-            x = np.vstack([at.z[: nq + n], at.inputs])
-            accelerations = f(at.t, x)
-            errors = _ratio(accelerations - at.z[nq + n : nq + 2 * n], size)
-            if not largest(errors) <= LIMITS["acceleration"]:  # errors of rounding are larger where it decides
-                determined = np.isfinite(accelerations)
-                rounding = self._rounding(f, at.t, x, accelerations)
-                of_inputs = self._rounding(given, at.t, at.z, given(at.t, at.z))
-                terms = np.vstack([np.zeros_like(at.z[: nq + n]), at.signals("input_terms")])
-                of_inputs += ROUNDING * self._response(f, at.t, x, accelerations, terms)
-                errors = errors / (1 + (rounding + np.minimum(of_inputs, BY_INPUTS * size)) / (limit * size))
-                errors = np.where(determined, errors, 0.0)
-                blunt = max(blunt, largest(np.where(determined, rounding / size, np.inf)))
-            worst = max(worst, largest(errors))
-        return max(worst, self._where_blunt(blunt, size)) if blunt > BLUNT else worst
-
-    def _where_blunt(self, blunt, size):
-        """Largest error of γ'' against the equations with multipliers, where rounding decides the mechanism's.
-
-        That the program determines γ'' is a note; if rounding decides these equations too, it is a doubt.
-        """
-        what = "the inputs do not determine the mechanism's accelerations"
-        if np.isfinite(blunt):
-            what = f"rounding changes the mechanism's accelerations by {blunt:.1e} of their size"
-        found = [self._by_multipliers(at) for at in self.instants]
-        if max(largest(rounding / size) for _, rounding in found) > BLUNT:
-            self.doubts.append(f"{what}: scale the units, or replace stiff springs and small masses by constraints")
-            return 0.0
-        self.notes.append(f"{what}: those under the program's constraints are compared instead")
-        limit = self.limit("acceleration")
-        return max(_excused(errors, size, limit, lambda r=rounding: r) for errors, rounding in found)
-
-    def _by_multipliers(self, at):
-        """Errors (n, N) of γ'' against the equations with multipliers, and the effect of rounding on these.
-
-        The effect is infinite where these equations do not determine γ''.
-        """
-        n, nq, z = self.model.n, self.model.nq, at.z[: len(self.model.jet_names)]
-
-        def accelerations(t, z):
-            matrix, right = at.model.multiplier_form(t, z)
-            return np.linalg.solve(matrix.transpose(2, 0, 1), right.T[:, :, None])[:, :n, 0].T
-
-        try:
-            again = accelerations(at.t, z)
-            return z[nq + n : nq + 2 * n] - again, self._rounding(accelerations, at.t, z, again)
-        except (np.linalg.LinAlgError, ValueError):  # singular, or of hidden constraints and higher orders
-            unknown = np.full((n, len(at.t)), np.inf)
-            return unknown, unknown
-
-    def multiplier_form(self):
-        """Largest residual of [M -B; C 0] [γ''; μ] = ..., relative to the largest terms of each row."""
-        parts, limit = [self._rows(at) for at in self.instants], self.limit("multiplier form")
-        terms = np.max([terms for _, terms, _ in parts], axis=0)[:, None]
-        return max(_excused(rows, terms, limit, rounding) for rows, _, rounding in parts)
-
-    def _rows(self, at):
-        """Residuals (rows, N) and largest terms (rows,) of the equations with multipliers, and their rounding."""
-        n, nq, n_z = self.model.n, self.model.nq, len(self.model.jet_names)
-        z, f = at.z[:n_z], at.model.signals("all_multipliers")[1]
-        mu = f.grid(at.t, z, at.model.parameters)
-        most = np.concatenate([self.sizes[nq + n : nq + 2 * n], np.abs(mu).max(axis=1, initial=0.0)])
-        unknowns = np.concatenate([z[nq + n : nq + 2 * n], mu])
-        few = max(1, int(MOST_ENTRIES / len(unknowns) ** 2))
-        parts = [slice(a, a + few) for a in range(0, len(at.t), few)]
-        rows, terms = [], []
-        for part in parts:
-            matrix, right = at.model.multiplier_form(at.t[part], z[:, part])
-            rows.append(_product(matrix, unknowns[:, part]) - right)
-            terms.append((_product(np.abs(matrix), most[:, None]) + np.abs(right)).max(axis=1))
-
-        def rounding():
-            return np.concatenate([self._rounding_of_rows(at, z, unknowns, part) for part in parts], axis=1)
-
-        return np.concatenate(rows, axis=1), np.max(terms, axis=0), rounding
-
-    def _rounding_of_rows(self, at, z, unknowns, part):
-        """Effect of rounding on the residuals of the equations with multipliers at some instants."""
-        t, z, unknowns, f = at.t[part], z[:, part], unknowns[:, part], at.model.signals("all_multipliers")[1]
-        n = self.model.n
-
-        def multipliers(t, z):
-            return f.grid(t, z, at.model.parameters)
-
-        def residual(t, z):
-            matrix, right = at.model.multiplier_form(t, z)
-            return _product(matrix, unknowns) - right
-
-        response = self._response(residual, t, z, residual(t, z), np.abs(z))
-        d_mu = self._response(multipliers, t, z, multipliers(t, z), np.abs(z))
-        matrix, _ = at.model.multiplier_form(t, z)
-        return ROUNDING * (response + _product(np.abs(matrix[:, n:]), d_mu))
+            x = np.vstack([at.z[:n_z], at.inputs, at.signals("all_multipliers")])
+            parts.append(at.model.function("balanced").grid(at.t, x, at.model.parameters).reshape(3, n, -1))
+        left, terms, sums = np.concatenate(parts, axis=2)
+        return largest(_ratio(left, terms.max(axis=1, keepdims=True) + ROUNDING / limit * sums))
 
     def residuals(self):
         """Largest residual of each row at any level, by the relative change of the jets that would remove it."""
@@ -532,30 +405,15 @@ class _Checks:
 
             levels = values(at.t, z)
             known = levels if at.first is None else self._as_stored(np.abs(levels), names, at.first)
-            response = self._residual_sizes(values, at.t, z, levels, known)
-            for (name, _), level, size in zip(names, known, response, strict=True):
+            few = np.unique(np.linspace(0, len(at.t) - 1, FEW_SIZES).round().astype(int))
+            response = self._response(values, at.t[few], z[:, few], levels[:, few], self.sizes[: f.n_x, None])
+            sizes = np.median(response, axis=1, keepdims=True)
+            for (name, _), level, size in zip(names, known, sizes, strict=True):
                 worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
         for name in self.model.reduction.mechanism.reported:  # of a program that inputs realise approximately
             del worst[f"residual {name}"]
             self.notes.append(f"the program's residual {name} is at most {largest(self.fresh.residual[name]):.2g}")
         return worst
-
-    def _residual_sizes(self, values, t, z, levels, known):
-        """Changes (rows, N) of residuals if each jet changes by its size; at least FLOOR of their medians.
-
-        Where residuals `known` are small beside the least of them, those at FEW_SIZES instants, in which the others
-        lie, decide.
-        """
-        few = np.unique(np.linspace(0, len(t) - 1, FEW_SIZES).round().astype(int))
-        steps, least = self.sizes[: len(z), None], None
-        if 2 * len(few) < len(t):
-            some = self._response(values, t[few], z[:, few], levels[:, few], steps)
-            least = FLOOR * np.median(some, axis=1, keepdims=True)
-        if least is None or not np.all(np.abs(known) <= AGREES * self.limit("residual") * least):
-            some, few = self._response(values, t, z, levels, steps), np.arange(len(t))
-            least = FLOOR * np.median(some, axis=1, keepdims=True)
-        nearest = np.searchsorted((few[1:] + few[:-1]) / 2, np.arange(len(t)))
-        return np.maximum(some[:, nearest], least)
 
     def _as_stored(self, levels, names, first):
         """Levels, or those that the run has stored if these are larger."""
@@ -582,64 +440,17 @@ class _Checks:
 
     # energy
 
-    def _balanced(self):
-        """Whether dE/dt is the power of the forces; a note if not."""
-        self.powers = [at.signals("power") for at in self.samples]
-        rate, _, size, by_time = np.concatenate(self.powers, axis=1)
-        first, second = self.model.nq, self.model.nq + self.model.n
-        inertial = self.mass * self.sizes[first:second] * self.sizes[second : second + self.model.n]
-        largest_term = max(np.abs(size).max(), np.abs(rate).max(), inertial.max())
-        balanced = not np.any(np.abs(by_time) > BALANCED * largest_term)
-        if not balanced:
-            reason = "the inertia terms depend on time or on more than wᵀMw/2"
-            self.notes.append(f"power balance: not applicable, {reason}")
-        return balanced
-
-    def balance(self):
-        """Errors of power and of energy, if the balance applies."""
-        if not self.balanced:
-            return {}
-        n, nq = self.model.n, self.model.nq
-        speeds, accelerations = self.sizes[nq : nq + n], self.sizes[nq + n : nq + 2 * n]
-        scale = FLOOR * (self.mass * speeds * accelerations).max()
-        errors, roundings = [], []
-        known = dict(enumerate(self.powers))  # of the samples, which are the first instants
-        for i, at in enumerate(self.instants):
-            rate, work, size, _ = known[i] if i in known else at.signals("power")
-            errors.append((rate - work)[None])
-            roundings.append(partial(self._rounding_of_power, at, errors[-1]))
-            inertial = np.abs(at.z[nq : nq + n] * at.z[nq + n : nq + 2 * n]).T @ self.mass
-            scale = max(scale, (np.abs(size) + np.abs(rate) + inertial).max())
-        limit = self.limit("power")
-        power = max(_excused(e, scale, limit, lambda r=r: r(scale)) for e, r in zip(errors, roundings, strict=True))
-        return {"power": power} | self._energy(scale)
-
-    def _rounding_of_power(self, at, error, scale):
-        """Effect of rounding on the error (1, N) of the power, that of inputs at most a part of its scale."""
-        f = at.model.signals("power")[1]
-
-        def defect(t, z):
-            rate, work, *_ = f.grid(t, z, at.model.parameters)
-            return (rate - work)[None]
-
-        of_inputs = np.minimum(ROUNDING * at.signals("power_terms"), BY_INPUTS * scale)
-        return self._rounding(defect, at.t, at.z[: f.n_x], error) + of_inputs
-
-    def _energy(self, power):
+    def energy(self):
         """Largest difference of the energy gained from the work, relative to the kinetic energy and the work done."""
+        if not self.balanced:
+            self.notes.append("energy: not applicable, the inertia terms depend on time or on more than wᵀMw/2")
+            return {}
         if self.between is None or not self.between.resolved.all():
             return {}
-        parts = [(at, at.model.signals("energy")[1]) for at in self.samples]
-        energies = [f.grid(at.t, at.z[: f.n_x], at.model.parameters) for at, f in parts]
-        energy = np.concatenate(energies, axis=1)[0]
+        energy = np.concatenate([at.signals("energy") for at in self.samples], axis=1)[0]
         kinetic = (self.mass * self.sizes[self.model.nq : self.model.nq + self.model.n] ** 2).max() / 2
         scale = max(kinetic, np.ptp(energy), *np.abs(np.cumsum(self.between.work)))
-        if not self._off(np.diff(energy)) <= AGREES * LIMITS["energy"] * scale:
-            rounding = [
-                self._rounding(lambda t, z, f=f, at=at: f.grid(t, z, at.model.parameters), at.t, at.z[: f.n_x], values)
-                for (at, f), values in zip(parts, energies, strict=True)
-            ]
-            scale += max(map(np.max, rounding)) / LIMITS["energy"]
+        scale += ROUNDING / LIMITS["energy"] * self.powers[4].max()
         work = self._work(np.diff(energy), AGREES * LIMITS["energy"] * scale)
         if not np.isfinite(work).all():
             first = self.run.t[int(np.argmin(np.isfinite(work)))]
@@ -691,8 +502,8 @@ class _Checks:
 
             x = at.z[: len(self.model.state_names)]
             again = jets(at.t, x)
-            rounding = ROUNDING * self._response(jets, at.t, x, again, np.abs(x))
-            sizes = self.sizes[nq + top * n :, None] + rounding / self.limit("higher jets")
+            rounding = self._response(jets, at.t, x, again, np.abs(x))
+            sizes = self.sizes[nq + top * n :, None] + ROUNDING / self.limit("higher jets") * rounding
             worst = max(worst, largest((at.z[nq + top * n :] - again) / sizes))
         return {"higher jets": worst}
 
@@ -731,20 +542,6 @@ def _regular(model, t, z):
         return np.ones(len(t), dtype=bool)
     least, of_all = (np.linalg.svd(b, compute_uv=False)[:, -1] for b in (B[:, :, dependent], B))
     return least > AT_PIVOT_ZERO * of_all
-
-
-def _product(matrix, vectors):
-    """Matrices (rows, columns, N) times vectors (columns, N), or one vector (columns, 1)."""
-    return (matrix * vectors).sum(axis=1)
-
-
-def _excused(errors, size, limit, rounding):
-    """The largest of errors (n, N) relative to sizes; where it exceeds its limit, relative to what rounding explains.
-
-    `rounding` returns the effect of rounding on the errors, which divided by the limit adds to the sizes.
-    """
-    plain = largest(_ratio(errors, size))
-    return plain if plain <= limit else largest(_ratio(errors, size + rounding() / limit))
 
 
 def _ratio(errors, sizes):

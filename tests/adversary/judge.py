@@ -117,7 +117,7 @@ def _attempt(case, verified=True):
         a.run = sv.simulate(a.model, a.start, (0.0, SPAN), method, t_eval=np.linspace(0.0, SPAN, SAMPLES))
         if verified:
             a.stage = "verify"
-            a.proof = sv.verify(a.model, a.run, segments=1)
+            a.proof = sv.verify(a.run, segments=1)
     except (Exception, TooMuchWork) as error:  # noqa: BLE001
         a.error = error
     return a
