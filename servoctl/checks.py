@@ -23,9 +23,13 @@ MOST_COUNT = 10**9  # samples, steps or rows: products of two such counts fit in
 LONGEST_NAME = 255  # bytes of a file's name in common file systems
 MOST_MEMORY = 8e9  # bytes for all samples: the memory of common machines
 SUFFIXES = {
-    "actuator": "_input", "actuator or rate": "_input", "output": "_output", "parameter": "_parameter",
-    "residual": "_residual", "row": "_residual",
-}  # fmt: skip
+    "actuator": "_input",
+    "actuator or rate": "_input",
+    "output": "_output",
+    "parameter": "_parameter",
+    "residual": "_residual",
+    "row": "_residual",
+}
 OF_REACTIONS = ("multiplier_", "reaction_")  # how names of their components begin
 
 
@@ -156,8 +160,11 @@ def distinct(kind, names, others, bases=()):
         if taken and (read[name] in others or read[name] in names):
             raise SpecificationError(
                 f"The {kind} {name!r} has the name of another signal, and {read[name]!r} is taken, too.",
-                "What is read by a name is one signal.", do="Rename one of them.", name=name, taken=read[name],
-            )  # fmt: skip
+                "What is read by a name is one signal.",
+                do="Rename one of them.",
+                name=name,
+                taken=read[name],
+            )
     return read
 
 

@@ -67,7 +67,7 @@ def rows_of(head, rows):
     numeric = [all(_is_number(row[i]) for row in rows) for i in range(len(head))]
 
     def line(tag, cells):
-        marked = (f'<{tag}{" class=n" * n}>{_escaped(c)}</{tag}>' for c, n in zip(cells, numeric, strict=True))
+        marked = (f"<{tag}{' class=n' * n}>{_escaped(c)}</{tag}>" for c, n in zip(cells, numeric, strict=True))
         return f"<tr>{''.join(marked)}</tr>"
 
     return f"<table>{line('th', head)}{''.join(line('td', row) for row in rows)}</table>"
@@ -79,9 +79,11 @@ def lines_of(lines):
     for line in (line.strip() for line in lines):
         label = LABEL.fullmatch(line)
         left = ' style="text-align: left"'
-        cells += [f"<tr><td{left}>{_escaped(label[1])}</td><td{left}>{_escaped(label[2])}</td></tr>"] if label else [
-            f'<tr><td colspan="2"{left}>{_escaped(line)}</td></tr>'
-        ]
+        cells += (
+            [f"<tr><td{left}>{_escaped(label[1])}</td><td{left}>{_escaped(label[2])}</td></tr>"]
+            if label
+            else [f'<tr><td colspan="2"{left}>{_escaped(line)}</td></tr>']
+        )
     return f"<table>{''.join(cells)}</table>"
 
 

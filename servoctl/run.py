@@ -21,8 +21,16 @@ AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one b
 SAME_TIME = 1e-12  # relative: rounding of an instant
 AGREES = 1e-6  # relative: difference of a signal in a file from that of a model, below which the run is of this model
 FACTS = {
-    "method": str, "drift": str, "counters": dict, "success": bool, "status": int, "message": str, "knots": list,
-    "jet_names": list, "internal": dict, "units": dict,
+    "method": str,
+    "drift": str,
+    "counters": dict,
+    "success": bool,
+    "status": int,
+    "message": str,
+    "knots": list,
+    "jet_names": list,
+    "internal": dict,
+    "units": dict,
 }  # of a saved run
 
 

@@ -16,9 +16,16 @@ import casadi as ca
 from servoctl.codegen.scaling import needed
 from servoctl.jets.pieces import Constant, operand_values
 
-CYCLES = defaultdict(lambda: 40, {  # of today's processors, from the last operand to the value
-    ca.OP_ADD: 4, ca.OP_SUB: 4, ca.OP_MUL: 4, ca.OP_NEG: 1, ca.OP_INV: 14,
-})  # fmt: skip
+CYCLES = defaultdict(
+    lambda: 40,
+    {  # of today's processors, from the last operand to the value
+        ca.OP_ADD: 4,
+        ca.OP_SUB: 4,
+        ca.OP_MUL: 4,
+        ca.OP_NEG: 1,
+        ca.OP_INV: 14,
+    },
+)
 AHEAD = 60  # cycles: about one stage, by which coordinates are known before velocities, which are their rates
 FACTORS = 8  # of one product, at most
 WAITING = 0.3  # operations in a cycle of the longest chain: the processor works ahead, but not all the time

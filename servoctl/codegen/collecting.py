@@ -19,14 +19,29 @@ PAIRED = 8  # sums among a sum's factors: of more of them no two are multiplied 
 ADDED = (0, 1, 2)  # terms by which a sum may grow where another is multiplied out: the fastest result is taken
 NOTHING = ((), 0.0)  # the term of a sum without terms
 _DECIDING = {
-    ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR, ca.OP_SIGN, ca.OP_FMIN, ca.OP_FMAX,
-    ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMOD, ca.OP_REMAINDER,
-}  # fmt: skip
+    ca.OP_LT,
+    ca.OP_LE,
+    ca.OP_EQ,
+    ca.OP_NE,
+    ca.OP_NOT,
+    ca.OP_AND,
+    ca.OP_OR,
+    ca.OP_SIGN,
+    ca.OP_FMIN,
+    ca.OP_FMAX,
+    ca.OP_FLOOR,
+    ca.OP_CEIL,
+    ca.OP_FMOD,
+    ca.OP_REMAINDER,
+}
 _SIGNS = {ca.OP_ADD: (1.0, 1.0), ca.OP_SUB: (1.0, -1.0), ca.OP_NEG: (-1.0,)}
 _POWERS = {
-    ca.OP_MUL: (1.0, (1, 1)), ca.OP_SQ: (1.0, (2,)), ca.OP_TWICE: (2.0, (1,)), ca.OP_DIV: (1.0, (1, -1)),
+    ca.OP_MUL: (1.0, (1, 1)),
+    ca.OP_SQ: (1.0, (2,)),
+    ca.OP_TWICE: (2.0, (1,)),
+    ca.OP_DIV: (1.0, (1, -1)),
     ca.OP_INV: (1.0, (-1,)),
-}  # fmt: skip
+}
 
 
 def ways(statements):

@@ -217,9 +217,14 @@ def _compile(text, flags, target, command):
         for some in dict.fromkeys((optional, _optional_flags(), ())):
             done = subprocess.run(
                 [*command, *flags, *some, f"-I{SOURCES}", "-x", "c", "-", "-o", temporary, "-lm"],
-                input=text, encoding="utf-8", errors="replace", capture_output=True, cwd=target.parent,
-                check=False, timeout=PATIENCE_WITH_COMPILER,
-            )  # fmt: skip
+                input=text,
+                encoding="utf-8",
+                errors="replace",
+                capture_output=True,
+                cwd=target.parent,
+                check=False,
+                timeout=PATIENCE_WITH_COMPILER,
+            )
             if done.returncode == 0:
                 break
         else:

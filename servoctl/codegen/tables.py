@@ -22,6 +22,7 @@ BOUND = "/* bound */"  # begins the C line of a table that `bind` leads to its n
 _bound = {}  # lookups by name
 MARGIN = 1e-6  # of a cell of a table: how far rounding may lead beyond its ends
 
+
 class Row(NamedTuple):
     """The operation that finds the row of a value s in a table, the number of knots that it has reached."""
 
@@ -172,9 +173,12 @@ class _Knots(ctypes.Structure):
     """`Knots` of table.h."""
 
     _fields_ = (
-        ("n", ctypes.c_int), ("start", ctypes.c_double), ("cells_per_second", ctypes.c_double),
-        ("at", ctypes.c_void_p), ("cells", ctypes.c_void_p),
-    )  # fmt: skip
+        ("n", ctypes.c_int),
+        ("start", ctypes.c_double),
+        ("cells_per_second", ctypes.c_double),
+        ("at", ctypes.c_void_p),
+        ("cells", ctypes.c_void_p),
+    )
 
 
 def _array(numbers):

@@ -76,12 +76,17 @@ def _derived(plant, law, disturbed, residuals):
     t_k, row, written, common_values = _law_in_c(law)
     phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p), t_k)
     phi, v, v_values = _apart(phi, constants)
-    sizes = {
-        "NX": x.numel(), "NU": n_u, "NP": p.numel(), "NC": n_c, "NW": w.numel(), "NV": v.numel(),
-        "ND": len(disturbed), "NM": len(law.measures), "NZ": len(law.state), "NO": law.n_out,
-        "NL": common_values.numel(), "VECTORS": VECTORS, "LOOKED": LOOKED, "NS": s.numel(), "NR": phi.numel(),
-        "NT": x.numel() + n_u + phi.numel(),
-    }  # fmt: skip
+    vectors = {"NX": x, "NP": p, "NW": w, "NV": v, "NL": common_values, "NS": s, "NR": phi}
+    sizes = {name: vector.numel() for name, vector in vectors.items()}
+    sizes |= {
+        "NU": n_u,
+        "NC": n_c,
+        "ND": len(disturbed),
+        "NM": len(law.measures),
+        "NZ": len(law.state),
+        "NO": law.n_out,
+    }
+    sizes |= {"NT": sizes["NX"] + n_u + sizes["NR"], "VECTORS": VECTORS, "LOOKED": LOOKED}
     where = ", ".join(str(plant.state_names.index(name)) for name in law.measures) or "0"
     given = {"PROJECTED": project is not None, "CALLED": not written}
     texts = {"NAME": "batch", "MEASURED": f"{{{where}}}"} | {name: "" for name, is_so in given.items() if is_so}
@@ -215,13 +220,11 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, s
     depth = 1 + max(loop.delay, late)
     constants, x0, scale = (part[:, columns] for part in cases)
     deviations, keys = noise or (None, None)
-    arguments = Arguments(**vars(loop) | {
-        "constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "p": None,
-        "law": step and ctypes.cast(step, ctypes.c_void_p),
-        "deviations": deviations, "keys": None if keys is None else keys[columns],
-        "depth": depth, "every": every, "columns": blocks * width, "n_traced": len(traced), "traced": traced,
-        "gathered": gathered, "trace": trace,
-    })  # fmt: skip
+    given = {"constants": constants, "x0": x0, "scale": scale, "p": None, "table": _common(unit, loop), "depth": depth}
+    given |= {"deviations": deviations, "keys": None if keys is None else keys[columns]}
+    given |= {"law": step and ctypes.cast(step, ctypes.c_void_p), "columns": blocks * width, "every": every}
+    given |= {"traced": traced, "n_traced": len(traced), "gathered": gathered, "trace": trace}
+    arguments = Arguments(**vars(loop) | given)
 
     def run(first, last):
         scratch = np.empty(2 * depth * loop.n_u * width + 1)

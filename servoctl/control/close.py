@@ -23,10 +23,16 @@ CONSISTENT = 1e-6  # of the state: the largest residual of a material constraint
 
 
 def close(
-    plant: Plant, law: Law | Callable[..., Any], x0: ArrayLike | Mapping[str, float], t_span: tuple[float, float], *,
-    sensors: Sensors | None = None, timing: Timing | None = None,
-    disturbance: Mapping[str, Callable[..., Any] | float] | None = None, plan: Run | None = None,
-) -> Closed:  # fmt: skip
+    plant: Plant,
+    law: Law | Callable[..., Any],
+    x0: ArrayLike | Mapping[str, float],
+    t_span: tuple[float, float],
+    *,
+    sensors: Sensors | None = None,
+    timing: Timing | None = None,
+    disturbance: Mapping[str, Callable[..., Any] | float] | None = None,
+    plan: Run | None = None,
+) -> Closed:
     """Run a sampled law on a plant.
 
     In each sample the state is measured, with noise and quantisation; the law computes a command; after the delay the
@@ -143,15 +149,30 @@ def loop_of(plant, law, x0, t_span, conditions):
     substeps, transport = steps(plant, law.period, timing.substeps, t0, x0, initial)
     require_few_steps(samples, substeps, plant.function("ode").operations)
     return Loop(
-        samples=samples, substeps=substeps, delay=timing.delay, n_u=len(plant.inputs), n_out=law.n_out, first=first,
-        at_u=len(plant.parameters), t0=t0, period=law.period, p=plant.p(), x0=x0, z0=law.state, table=law.schedule.T,
+        samples=samples,
+        substeps=substeps,
+        delay=timing.delay,
+        n_u=len(plant.inputs),
+        n_out=law.n_out,
+        first=first,
+        at_u=len(plant.parameters),
+        t0=t0,
+        period=law.period,
+        p=plant.p(),
+        x0=x0,
+        z0=law.state,
+        table=law.schedule.T,
         measured=np.array([plant.state_names.index(name) for name in law.measures], dtype=np.int64),
-        disturbed=disturbed, initial_input=initial,
+        disturbed=disturbed,
+        initial_input=initial,
         noise=sensors.noisy(law.measures, samples + 1) if sensors.noise else None,
         quantum=sensors.quantum(law.measures) if sensors.quantisation else None,
-        low=low, high=high, change=change, transport=transport,
+        low=low,
+        high=high,
+        change=change,
+        transport=transport,
         **conditions.forces(t0, law.period / substeps, samples * substeps),
-    )  # fmt: skip
+    )
 
 
 def _initial_input(law, t0):
@@ -210,9 +231,22 @@ def finished(plant, law, plan, loop, conditions, advance=None):
         INTERRUPTED: f"interrupted at t = {end - loop.period:.7g} s; what was computed is kept",
     }.get(status, f"the law raised {type(status).__name__} at t = {end:.6g} s")
     run = Closed(
-        t, x.T, inputs.T, law_y[:, :m].T, law_x[: len(x), :n_y].T, law_x[: len(x), n_y:].T, law_y[:, m + n_z :].T,
-        plant, law, plan, loop, conditions, status == FINISHED, {FINISHED: 0, INTERRUPTED: 1}.get(status, -1), message,
-    )  # fmt: skip
+        t,
+        x.T,
+        inputs.T,
+        law_y[:, :m].T,
+        law_x[: len(x), :n_y].T,
+        law_x[: len(x), n_y:].T,
+        law_y[:, m + n_z :].T,
+        plant,
+        law,
+        plan,
+        loop,
+        conditions,
+        status == FINISHED,
+        {FINISHED: 0, INTERRUPTED: 1}.get(status, -1),
+        message,
+    )
     if status in (FINISHED, INTERRUPTED):
         return _of_same_orders(run)
     error = status if isinstance(status, BaseException) else _stopped(law, loop, status, end)

@@ -65,11 +65,20 @@ def affine(name, reference, K, K_i=None, residuals=None, info=None):
         schedule.append(K_i.reshape(len(K), -1).T)
         schedule.append(integration(reference, residuals))
     return Law(
-        name=name, measures=measures, inputs=plant.inputs, rate=reference.rate, t0=reference.t[0],
-        step=affine_law(measures, len(plant.inputs), residuals=residuals), schedule=np.vstack(schedule),
-        state=np.zeros(len(names)), state_names=integral_names(names), initial_input=reference.initial_input,
-        plan=reference.plan, info=info or {}, integrators=tuple(range(len(names))),
-    )  # fmt: skip
+        name=name,
+        measures=measures,
+        inputs=plant.inputs,
+        rate=reference.rate,
+        t0=reference.t[0],
+        step=affine_law(measures, len(plant.inputs), residuals=residuals),
+        schedule=np.vstack(schedule),
+        state=np.zeros(len(names)),
+        state_names=integral_names(names),
+        initial_input=reference.initial_input,
+        plan=reference.plan,
+        info=info or {},
+        integrators=tuple(range(len(names))),
+    )
 
 
 def integration(reference, residuals):

@@ -32,7 +32,13 @@ def feedforward(plan: Run, plant: Plant, rate: float = 100.0) -> Law:
     reference = Reference(plan, plant, rate)
     u_ff = ca.SX.sym("u_ff", len(plant.inputs))
     return Law(
-        name="feedforward", measures=(), inputs=plant.inputs, rate=reference.rate, t0=reference.t[0],
-        step=law_step("feedforward", ca.SX.sym("t"), ca.SX.sym("x", 0), u_ff, [u_ff]), schedule=reference.inputs(),
-        initial_input=reference.initial_input, plan=plan,
-    )  # fmt: skip
+        name="feedforward",
+        measures=(),
+        inputs=plant.inputs,
+        rate=reference.rate,
+        t0=reference.t[0],
+        step=law_step("feedforward", ca.SX.sym("t"), ca.SX.sym("x", 0), u_ff, [u_ff]),
+        schedule=reference.inputs(),
+        initial_input=reference.initial_input,
+        plan=plan,
+    )

@@ -349,9 +349,12 @@ class _Extension:
 
 
 def computed(
-    plan: Run, plant: Plant, rate: float = 100.0, poles: float | Mapping[str, Sequence[complex]] | None = None,
+    plan: Run,
+    plant: Plant,
+    rate: float = 100.0,
+    poles: float | Mapping[str, Sequence[complex]] | None = None,
     delay: int = 0,
-) -> Law:  # fmt: skip
+) -> Law:
     """Inverse dynamics at the measured state, with error dynamics by poles.
 
     Each residual obeys Π(D - λ_i) φ = 0 if the machine is the plant: φ is differentiated along the plant until the
@@ -403,11 +406,19 @@ def computed(
     info = {"orders": linear.orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {order}" for name, order in linear.orders.items())
     return Law(
-        name="computed", measures=plant.state_names, inputs=plant.inputs, rate=rate, t0=float(plan.t[0]),
-        step=linear.step, schedule=np.column_stack([np.concatenate(column) for column in columns]),
-        state=linear.start, state_names=linear.state_names,
-        initial_input=np.array([plan[name][0] for name in plant.inputs]), plan=plan, info=info,
-    )  # fmt: skip
+        name="computed",
+        measures=plant.state_names,
+        inputs=plant.inputs,
+        rate=rate,
+        t0=float(plan.t[0]),
+        step=linear.step,
+        schedule=np.column_stack([np.concatenate(column) for column in columns]),
+        state=linear.start,
+        state_names=linear.state_names,
+        initial_input=np.array([plan[name][0] for name in plant.inputs]),
+        plan=plan,
+        info=info,
+    )
 
 
 def _require_smooth(plan, orders):

@@ -114,9 +114,14 @@ class SmallQP:
 
 
 def limited(
-    law: Law, plant: Plant, *, bounds: Mapping[str, Any] | None = None, weights: Mapping[str, float] | None = None,
-    priority: Sequence[str] | None = None, horizon: float = HORIZON,
-) -> Law:  # fmt: skip
+    law: Law,
+    plant: Plant,
+    *,
+    bounds: Mapping[str, Any] | None = None,
+    weights: Mapping[str, float] | None = None,
+    priority: Sequence[str] | None = None,
+    horizon: float = HORIZON,
+) -> Law:
     """A law whose inputs are allocated within the plant's limits of magnitude and rate, and within bounds of outputs.
 
     At each sample the inputs u differ from those of the law, u_law, at the least cost to the program:
@@ -382,11 +387,23 @@ class Allocation(Value):
         """Sizes and tolerances of allocation.h."""
         law = self.law
         return {
-            "NM": len(law.measures), "NZ_LAW": len(law.state), "NU": len(self.sizes), "NX": self.plant.n_x,
-            "NSIG": len(law.signals), "NROW": law.schedule.shape[0], "NK": len(self.residuals), "NJ": len(self.bounds),
-            "NC": len(self.plant.parameters), "NI": len(law.integrators), "QP_STEPS": STEPS, "QP_MET": WITHIN,
-            "QP_DEPENDENT": DEPENDENT, "QP_TINY": TINY, "MET": MET, "GIVEN_WAY": GIVEN_WAY,
-        } | ({} if law.input_matrix is None else {"CORRECTED_BY": 1})  # fmt: skip
+            "NM": len(law.measures),
+            "NZ_LAW": len(law.state),
+            "NU": len(self.sizes),
+            "NX": self.plant.n_x,
+            "NSIG": len(law.signals),
+            "NROW": law.schedule.shape[0],
+            "NK": len(self.residuals),
+            "NJ": len(self.bounds),
+            "NC": len(self.plant.parameters),
+            "NI": len(law.integrators),
+            "QP_STEPS": STEPS,
+            "QP_MET": WITHIN,
+            "QP_DEPENDENT": DEPENDENT,
+            "QP_TINY": TINY,
+            "MET": MET,
+            "GIVEN_WAY": GIVEN_WAY,
+        } | ({} if law.input_matrix is None else {"CORRECTED_BY": 1})
 
     def __call__(self, t, x, column):
         """The inputs, the next controller state and the signals, in one array."""

@@ -101,9 +101,11 @@ def run_loop(ode, law, loop, advance=None):
     native = ode.native("closed", 4 * loop.samples * loop.substeps) if advance is None else None
     exact = native is not None and not n_z and loop.noise is None and loop.quantum is None  # the law gets states
     logs = {
-        "x": np.empty((n, ode.n_x)), "law_x": np.empty((1 if exact else n + 1, n_y + n_z)),
-        "law_y": np.empty((n, loop.n_out)), "input": np.empty((n, loop.n_u)),
-    }  # fmt: skip
+        "x": np.empty((n, ode.n_x)),
+        "law_x": np.empty((1 if exact else n + 1, n_y + n_z)),
+        "law_y": np.empty((n, loop.n_out)),
+        "input": np.empty((n, loop.n_u)),
+    }
     if native is None:
         done, status = _interpreted(ode, law, loop, advance or hold, logs)
     else:

@@ -31,10 +31,14 @@ Q_POSITION, Q_VELOCITY, R_INPUT, Q_INTEGRAL = 1e3, 1e2, 1e-3, 1e4
 
 
 def lqr(
-    plan: Run, plant: Plant, rate: float = 100.0, Q: ArrayLike | Mapping[str, float] | None = None,
-    R: ArrayLike | Mapping[str, float] | None = None, integral: bool | ArrayLike | Mapping[str, float] | None = None,
+    plan: Run,
+    plant: Plant,
+    rate: float = 100.0,
+    Q: ArrayLike | Mapping[str, float] | None = None,
+    R: ArrayLike | Mapping[str, float] | None = None,
+    integral: bool | ArrayLike | Mapping[str, float] | None = None,
     varying: bool = True,
-) -> Law:  # fmt: skip
+) -> Law:
     """The plan's actuation with sampled linear-quadratic feedback about the plan.
 
     The plant is linearised along the plan in the middle of each sample and discretised exactly under the zero-order

@@ -104,13 +104,22 @@ def output_feedback(
     schedule += [integration(reference, residuals)] if residuals else []
     input_matrix = np.concatenate([B, np.zeros((len(B), n_z, B.shape[2]))], axis=1)
     return Law(
-        name=f"{law.name}, output feedback", measures=measured, inputs=plant.inputs, rate=law.rate, t0=law.t0,
-        step=estimating_law(plant.state_names, where, len(plant.inputs), residuals), schedule=np.vstack(schedule),
-        state=np.zeros(n_x + n_z), initial_input=law.initial_input, plan=law.plan,
+        name=f"{law.name}, output feedback",
+        measures=measured,
+        inputs=plant.inputs,
+        rate=law.rate,
+        t0=law.t0,
+        step=estimating_law(plant.state_names, where, len(plant.inputs), residuals),
+        schedule=np.vstack(schedule),
+        state=np.zeros(n_x + n_z),
+        initial_input=law.initial_input,
+        plan=law.plan,
         state_names=(*(f"estimated error of {name}" for name in plant.state_names), *integral_names(gains.residuals)),
         info=Deferred({}, (*law.info.keys(), FILTER_RADIUS), partial(_info, law, A, L @ C, basis)),
-        integrators=tuple(range(n_x, n_x + n_z)), feedback=gains, input_matrix=input_matrix,
-    )  # fmt: skip
+        integrators=tuple(range(n_x, n_x + n_z)),
+        feedback=gains,
+        input_matrix=input_matrix,
+    )
 
 
 def _info(law, A, LC, basis):

@@ -17,9 +17,12 @@ UNSTABLE = 1e-7  # a spectral radius above 1 by more than this is unstable; roun
 
 
 def pd(
-    plan: Run, plant: Plant, rate: float = 100.0, kp: Mapping[str, float] | None = None,
+    plan: Run,
+    plant: Plant,
+    rate: float = 100.0,
+    kp: Mapping[str, float] | None = None,
     kd: Mapping[str, float] | None = None,
-) -> Law:  # fmt: skip
+) -> Law:
     """The plan's actuation, with feedback of the error of each actuator's displacement and its rate.
 
     u_a = u_plan - kp_a e_a - kd_a de_a/dt with e_a = E_aᵀ(γ - γ_plan), the displacement on which the actuator works.

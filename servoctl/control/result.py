@@ -82,9 +82,11 @@ class Closed(Sampled, Value):
         """Names of the evaluated signals, by the function of the plant that evaluates them."""
         mechanism = self.plant.mechanism
         return {
-            "accelerations": mechanism.q.jet_names(2), "outputs": tuple(mechanism.outputs), "power": ("energy",),
+            "accelerations": mechanism.q.jet_names(2),
+            "outputs": tuple(mechanism.outputs),
+            "power": ("energy",),
             "multipliers": self.plant.equations.multiplier_names,
-        }  # fmt: skip
+        }
 
     @property
     def units(self) -> dict[str, str]:
@@ -266,9 +268,22 @@ class Closed(Sampled, Value):
         for kind, values in kinds.items():
             stored |= {f"{kind} {name}": value for name, value in values.items()}
         return Run(
-            self.t, self.states, p.state_names, None, f"closed loop: {self.law.name}", "", self._counters, self.success,
-            self.status, self.message, (), (), stored, dict(self.residual), stored_units=self.units,
-        )  # fmt: skip
+            self.t,
+            self.states,
+            p.state_names,
+            None,
+            f"closed loop: {self.law.name}",
+            "",
+            self._counters,
+            self.success,
+            self.status,
+            self.message,
+            (),
+            (),
+            stored,
+            dict(self.residual),
+            stored_units=self.units,
+        )
 
     def save(self, path):
         """Save the run as npz, without pickle; `load` returns it as a plain `Run`.

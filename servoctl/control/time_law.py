@@ -65,10 +65,15 @@ class TimeLaw:
 
 
 def fastest(
-    mechanism: Mechanism, program: Program, limits: Mapping[str, Any], t_span: tuple[float, float],
-    start: Mapping[str, float] | None = None, guess: Mapping[str, float] | None = None,
-    parameters: Mapping[str, float] | None = None, shape: bool = False,
-) -> TimeLaw:  # fmt: skip
+    mechanism: Mechanism,
+    program: Program,
+    limits: Mapping[str, Any],
+    t_span: tuple[float, float],
+    start: Mapping[str, float] | None = None,
+    guess: Mapping[str, float] | None = None,
+    parameters: Mapping[str, float] | None = None,
+    shape: bool = False,
+) -> TimeLaw:
     """The fastest time law along the path of a program under which signals keep their limits.
 
     By default the time is stretched evenly, q(t0 + (t - t0)/σ): the geometry of the motion stays; speeds scale with
@@ -188,8 +193,9 @@ def _optimal(scene, bar):
         f"Between the nodes {binding[0] or 'a signal'} exceeds its limit by {excess:.2g} of it.",
         "A time-optimal law keeps its limits at all instants.",
         do="Add a limit of rates, as {'dtrolley': ...}, or choose shape=False.",
-        name=binding[0], excess=float(excess),
-    )  # fmt: skip
+        name=binding[0],
+        excess=float(excess),
+    )
 
 
 @frozen

@@ -412,5 +412,6 @@ def _failed(stats):
         f"IPOPT ends with {status} after {stats['iter_count']} iterations.",
         "A time-optimal law is a minimum of the duration.",
         do="Choose wider limits, a simpler curve, or shape=False.",
-        status=status, iterations=stats["iter_count"],
-    )  # fmt: skip
+        status=status,
+        iterations=stats["iter_count"],
+    )

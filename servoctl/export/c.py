@@ -24,9 +24,14 @@ from servoctl.reduction.reduce import require_outputs
 
 ITERATIONS, TOLERANCE = 30, 1e-13  # of Newton's method, as in `Compiled.newton`
 IN_FLOATS = {  # corrections that end it, at once and where they no longer fall; tolerances of an allocation
-    "TOLERANCE": 1e-6, "STALLED": 1e-3, "QP_MET": 1e-5, "QP_DEPENDENT": 1e-3, "QP_TINY": 1e-30, "MET": 1e-4,
+    "TOLERANCE": 1e-6,
+    "STALLED": 1e-3,
+    "QP_MET": 1e-5,
+    "QP_DEPENDENT": 1e-3,
+    "QP_TINY": 1e-30,
+    "MET": 1e-4,
     "GIVEN_WAY": 1e-4,
-}  # fmt: skip
+}
 COUNTED = 16777216  # 2^24: whole numbers up to it are floats
 LARGEST_CONDITION = 1e5  # of the metric of an allocation in floats, which have seven digits
 TIME = Scalar("t")
@@ -38,9 +43,14 @@ RESERVED += "while class new delete this template typename operator private publ
 
 
 def export_c(
-    source: Model | Law, folder: str | os.PathLike, *, name: str | None = None, start: State | None = None,
-    real: str = "double", thinned: float | None = None,
-) -> tuple[Path, Path]:  # fmt: skip
+    source: Model | Law,
+    folder: str | os.PathLike,
+    *,
+    name: str | None = None,
+    start: State | None = None,
+    real: str = "double",
+    thinned: float | None = None,
+) -> tuple[Path, Path]:
     """Write a model's feedforward and residuals, or a law's step, as NAME.c and NAME.h: self-contained C99.
 
     Main arguments
@@ -227,9 +237,13 @@ def _of_model(model, start):
     feedforward = _algebraic if model.flat and model.reduction.top == 2 else _integrated
     further, last, sources, sizes = feedforward(model, x, z, p, u)
     return Contents(
-        (p, x, z, u, r, *([y] if outputs else [])), tuple(c for c in constants if np.size(c.values)),
-        functions | further, (*routines, *last), sources, sizes,
-    )  # fmt: skip
+        (p, x, z, u, r, *([y] if outputs else [])),
+        tuple(c for c in constants if np.size(c.values)),
+        functions | further,
+        (*routines, *last),
+        sources,
+        sizes,
+    )
 
 
 def _algebraic(model, x, z, p, u):

@@ -50,9 +50,14 @@ def appell_hamel(form="linear"):
         raise unknown(form, ("linear", "squared"), "form of the program")
 
     mechanism = sv.Mechanism(
-        q, gibbs=S, potential=-p.m * p.g * z, outputs={"tension": p.m * (p.g - ddz)}, parameters=p,
-        shapes=_shapes(q, p), units={"tension": "N"},
-    )  # fmt: skip
+        q,
+        gibbs=S,
+        potential=-p.m * p.g * z,
+        outputs={"tension": p.m * (p.g - ddz)},
+        parameters=p,
+        shapes=_shapes(q, p),
+        units={"tension": "N"},
+    )
     return mechanism, sv.Program(rolling | {"string": z + p.b * phi}, by="ideal")  # (4.5)
 
 

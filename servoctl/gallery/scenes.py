@@ -132,8 +132,15 @@ _APPELL_HAMEL = {
 }
 
 _PRECESSION = {  # dphi by g tan λ = a Ω (3 s/2 + Ω sin(λ)/4), s = dphi - Ω sin λ
-    "x": 0.0, "y": 0.0, "psi": 0.0, "lean": 0.35, "phi": 0.0, "dpsi": 1.5, "dlean": 0.0, "dphi": 5.733703050854819,
-}  # fmt: skip
+    "x": 0.0,
+    "y": 0.0,
+    "psi": 0.0,
+    "lean": 0.35,
+    "phi": 0.0,
+    "dpsi": 1.5,
+    "dlean": 0.0,
+    "dphi": 5.733703050854819,
+}
 
 gallery = {
     # --- flat machines

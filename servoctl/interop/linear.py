@@ -62,9 +62,13 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
         For a disturbance of what is no generalised force or parameter.
     """
     _require_applicable(
-        thing, x=x is not None, u=u is not None, controller_state=controller_state is not None, rate=rate is not None,
+        thing,
+        x=x is not None,
+        u=u is not None,
+        controller_state=controller_state is not None,
+        rate=rate is not None,
         disturbed=as_list(disturbed) != [],
-    )  # fmt: skip
+    )
     t = finite("t", t, "time")
     if isinstance(thing, Plant):
         return _linear_plant(thing, t, thing.state(x), u, rate, disturbed, system_name(name, "plant"))
@@ -205,9 +209,16 @@ def loop_gain(plant, law, at):
     wires = [[f"plant.{a}", f"law.{a}"] for a in law.output_labels if a != at]
     wires += [[f"law.{y}", f"plant.{y}"] for y in law.input_labels]
     return control.interconnect(
-        [plant, law], wires, inplist=[f"plant.{at}"], outlist=[f"-law.{at}"], inputs=[at], outputs=[f"-{at}"],
-        name=f"loop gain at {at}", warn_duplicate=False, check_unused=False,
-    )  # fmt: skip
+        [plant, law],
+        wires,
+        inplist=[f"plant.{at}"],
+        outlist=[f"-law.{at}"],
+        inputs=[at],
+        outputs=[f"-{at}"],
+        name=f"loop gain at {at}",
+        warn_duplicate=False,
+        check_unused=False,
+    )
 
 
 def _linear_plant(plant, t, x, u, rate, disturbed, name):
@@ -234,9 +245,16 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
     if rate is not None:
         A, B = (part[0] for part in discretised(A[None], B[None], 1.0 / positive("rate", rate)))
     return control.ss(
-        A, B, C, D, dt=0 if rate is None else 1.0 / float(rate), name=name, states=plant.state_names,
-        inputs=[*plant.inputs, *(f"disturbance {force}" for force in disturbed)], outputs=output_names(plant),
-    )  # fmt: skip
+        A,
+        B,
+        C,
+        D,
+        dt=0 if rate is None else 1.0 / float(rate),
+        name=name,
+        states=plant.state_names,
+        inputs=[*plant.inputs, *(f"disturbance {force}" for force in disturbed)],
+        outputs=output_names(plant),
+    )
 
 
 def _linear_law(law, t, x, controller_state, name):
@@ -269,10 +287,8 @@ def _linear_law(law, t, x, controller_state, name):
     J = jacobian(law.step, "x", t, np.append(y, z), law.schedule_at(t))
     n_y = len(y)
     A, B, C, D = J[m : m + n_z, n_y:], J[m : m + n_z, :n_y], J[:m, n_y:], J[:m, :n_y]
-    return control.ss(
-        A, B, C, D, dt=law.period, name=name, states=law.state_names, outputs=law.inputs,
-        inputs=signal_names(law.measures, law.inputs), remove_useless_states=False,
-    )  # fmt: skip
+    signals = {"states": law.state_names, "outputs": law.inputs, "inputs": signal_names(law.measures, law.inputs)}
+    return control.ss(A, B, C, D, law.period, name=name, remove_useless_states=False, **signals)
 
 
 def _linear_closed(closed, t, name):
@@ -309,9 +325,16 @@ def _late(system, plant, delay):
     D = np.hstack([np.zeros((system.noutputs, m)), system.D[:, m:]])
     names = [f"command of {name} {k} ago" for k in range(1, delay + 1) for name in plant.inputs]
     return control.ss(
-        A, B, C, D, dt=system.dt, name="plant", states=[*system.state_labels, *names],
-        inputs=system.input_labels, outputs=system.output_labels,
-    )  # fmt: skip
+        A,
+        B,
+        C,
+        D,
+        dt=system.dt,
+        name="plant",
+        states=[*system.state_labels, *names],
+        inputs=system.input_labels,
+        outputs=system.output_labels,
+    )
 
 
 def _linear_model(model, t, x, name):

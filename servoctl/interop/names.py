@@ -45,12 +45,14 @@ def connected(system, law_system, closed, name):
     wires = [[f"plant.{a}", f"law.{a}"] for a in law.inputs] + [[f"law.{y}", f"plant.{y}"] for y in measured]
     disturbances, outputs = [f"disturbance {name}" for name in disturbable_of(closed)], output_names(plant)
     return control.interconnect(
-        [system, law_system], wires, name=name,
+        [system, law_system],
+        wires,
+        name=name,
         inplist=[*(f"plant.{d}" for d in disturbances), *(f"law.{y}" for y in measured)],
         inputs=[*disturbances, *(f"noise {y}" for y in measured)],
         outlist=[*(f"plant.{y}" for y in outputs), *(f"law.{a}" for a in law.inputs)],
         outputs=[*outputs, *(f"command {a}" for a in law.inputs)],
-    )  # fmt: skip
+    )
 
 
 def stranger(thing, rule=RULE):

@@ -128,9 +128,14 @@ def _model(model, name):
         return np.concatenate([x, *(f(t, z, numbers) for group, f in groups if group)])
 
     return control.nlsys(
-        rates, outputs, name=name, inputs=0, states=model.state_names, outputs=[*model.state_names, *names],
+        rates,
+        outputs,
+        name=name,
+        inputs=0,
+        states=model.state_names,
+        outputs=[*model.state_names, *names],
         params=dict(zip(symbols, p.tolist(), strict=True)),
-    )  # fmt: skip
+    )
 
 
 def _parameter_values(p, symbols, params):
@@ -170,10 +175,9 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
         def update(t, x, u, params):
             return sampled(t, x, u, lambda inputs: numbers(np.append(inputs, u[m:]), params))
 
-    return control.nlsys(
-        update, outputs, name=name, inputs=inputs, states=states, outputs=output_names(plant), dt=period or 0,
-        params=dict(zip(symbols, plant.parameters.tolist(), strict=False)),
-    )  # fmt: skip
+    signals = {"inputs": inputs, "states": states, "outputs": output_names(plant)}
+    params = dict(zip(symbols, plant.parameters.tolist(), strict=False))
+    return control.nlsys(update, outputs, name=name, dt=period or 0, params=params, **signals)
 
 
 def _require_continuous(plant, substeps):
@@ -238,9 +242,12 @@ def _law(law, name, quantum=None):
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,
         lambda t, z, y, _: answer(t, z, y)[:m],
-        name=name, inputs=signal_names(law.measures, law.inputs), outputs=law.inputs, states=law.state_names or None,
+        name=name,
+        inputs=signal_names(law.measures, law.inputs),
+        outputs=law.inputs,
+        states=law.state_names or None,
         dt=law.period,
-    )  # fmt: skip
+    )
 
 
 def _closed(closed, name):

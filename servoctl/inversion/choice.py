@@ -57,11 +57,16 @@ SWINGS_ON = 1e-3  # speed at the end relative to the largest one, with which a f
 
 
 def inverse(
-    mechanism: Mechanism, program: Program, t_span: Sequence[float], *,
-    start: State | Mapping[str, float] | None = None, method: Method | str | None = None,
-    limits: Mapping[str, object] | None = None, bounds: Mapping[str, object] | None = None,
+    mechanism: Mechanism,
+    program: Program,
+    t_span: Sequence[float],
+    *,
+    start: State | Mapping[str, float] | None = None,
+    method: Method | str | None = None,
+    limits: Mapping[str, object] | None = None,
+    bounds: Mapping[str, object] | None = None,
     weight: float | Mapping[str, float] | None = None,
-) -> Run:  # fmt: skip
+) -> Run:
     """The motion and the actuation of a program by the inverse that its verdict allows.
 
     Flat programs are solved instant by instant, minimum-phase and marginal ones are integrated forward, hyperbolic ones

@@ -107,10 +107,15 @@ class Design(Shown):
 
 
 def design(
-    model: Model, vary: Mapping[str, object], t_span: Sequence[object], minimise: str = "rms",
-    of: str | Sequence[str] | Mapping[str, float] | None = None, limits: Mapping[str, object] | None = None,
-    start: Mapping[str, float] | None = None, guess: Mapping[str, float] | None = None,
-) -> Design:  # fmt: skip
+    model: Model,
+    vary: Mapping[str, object],
+    t_span: Sequence[object],
+    minimise: str = "rms",
+    of: str | Sequence[str] | Mapping[str, float] | None = None,
+    limits: Mapping[str, object] | None = None,
+    start: Mapping[str, float] | None = None,
+    guess: Mapping[str, float] | None = None,
+) -> Design:
     """Parameters of a program, such as via points and durations, of least actuation or time under limits.
 
     A local minimum by sequential quadratic programming with exact derivatives, found from the numbers of the model.
@@ -200,8 +205,10 @@ def _varied(model, vary):
                 f"{name} = {number:g} is outside its range, {low:g} to {high:g}.",
                 "The search begins at the numbers of the model.",
                 nearest=f"model.with_parameters({name}={min(max(number, low), high):g}).",
-                name=name, value=number, range=(low, high),
-            )  # fmt: skip
+                name=name,
+                value=number,
+                range=(low, high),
+            )
     return ranges
 
 
@@ -519,16 +526,27 @@ class Search:
             _require_no_growth(plan.model, plan)
             plan = judged(plan)
         limits = [
-            (name, side) for name, ends in self.limits.items()
+            (name, side)
+            for name, ends in self.limits.items()
             for (value, _), limit, side in zip(extremes(plan, name), ends, ("lower", "upper"), strict=True)
             if np.isfinite(limit) and abs(value - limit) <= REACHED * _size_of_limit(*ends)
-        ]  # fmt: skip
-        at_ends = [(name, "lower" if x < 0.5 else "upper") for name, x in zip(values, v, strict=True)
-                   if min(x, 1.0 - x) <= ACTIVE]  # fmt: skip
+        ]
+        at_ends = [
+            (name, "lower" if x < 0.5 else "upper")
+            for name, x in zip(values, v, strict=True)
+            if min(x, 1.0 - x) <= ACTIVE
+        ]
         return Design(
-            values, self.minimise, self.measured(v, plan), before, plan, verify(plan),
-            (*limits, *at_ends), float(self.gain(v)[0]), self.evaluated,
-        )  # fmt: skip
+            values,
+            self.minimise,
+            self.measured(v, plan),
+            before,
+            plan,
+            verify(plan),
+            (*limits, *at_ends),
+            float(self.gain(v)[0]),
+            self.evaluated,
+        )
 
     def measured(self, v, plan):
         """The cost of a motion, a peak refined between its samples."""
@@ -673,10 +691,15 @@ class NonlinearProgram:
         passed = [v]
         try:
             x = minimize(
-                self.cost, self.start(v), jac=True, method="SLSQP", bounds=self.bounds(low, high),
-                constraints=self.constraints, callback=lambda x: passed.append(np.array(x[: self.k])),
+                self.cost,
+                self.start(v),
+                jac=True,
+                method="SLSQP",
+                bounds=self.bounds(low, high),
+                constraints=self.constraints,
+                callback=lambda x: passed.append(np.array(x[: self.k])),
                 options={"maxiter": QUADRATIC_PROGRAMS, "ftol": UNCHANGED},
-            ).x  # fmt: skip
+            ).x
         except NoMotion as failure:
             return passed[-1], failure
         return np.clip(x[: self.k], low, high), None

@@ -65,11 +65,16 @@ SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 def relaxed(
-    plant: Plant, program: Program, t_span: Sequence[float], *,
+    plant: Plant,
+    program: Program,
+    t_span: Sequence[float],
+    *,
     weight: float | Mapping[str, float] | Sequence[float] | None = None,
-    limits: Mapping[str, object] | None = None, bounds: Mapping[str, object] | None = None,
-    start: State | Mapping[str, float] | None = None, end: str | Mapping[str, float] = "rest",
-) -> Run | Study:  # fmt: skip
+    limits: Mapping[str, object] | None = None,
+    bounds: Mapping[str, object] | None = None,
+    start: State | Mapping[str, float] | None = None,
+    end: str | Mapping[str, float] = "rest",
+) -> Run | Study:
     """The actuation that trades a program against effort: min ∫ Σ φ_i²/β_i + uᵀWu dt over all motions of the plant.
 
     As β falls, the motion tends to the exact inverse where one satisfies the ends; where none does, as for a program
@@ -236,8 +241,10 @@ class Relaxation(Transfer):
                 f"{worst[k]:.1e}, with {len(worst)} intervals.",
                 f"Relative to the states' sizes a plan misses them by at most {COARSE:g}.",
                 do="Choose a greater weight, wider limits or a shorter span.",
-                t=float(plan.mesh.edges[k]), defect=float(worst[k]), intervals=len(worst),
-            )  # fmt: skip
+                t=float(plan.mesh.edges[k]),
+                defect=float(worst[k]),
+                intervals=len(worst),
+            )
         return replace(plan, beta=beta)
 
     def _mesh(self):
@@ -316,8 +323,10 @@ class Relaxation(Transfer):
             f"Above {usual[i]:.3g} standing still costs less than the program.",
             nearest=f"{FIRST * usual[i]:.1g}.",
             do="A weight is in (unit of the residual)²/(unit of the inputs)², such as m²/N²; choose a smaller one.",
-            name=name, weight=float(beta[i]), most=float(usual[i]),
-        )  # fmt: skip
+            name=name,
+            weight=float(beta[i]),
+            most=float(usual[i]),
+        )
 
     def _failed(self, nlp, solution, status, plan):
         """The error of an iteration that ends without a solution: what would be exceeded without limits, and where."""
@@ -334,8 +343,11 @@ class Relaxation(Transfer):
                 f"IPOPT {said}; the largest violation is that of {row} at t = {t:.4g} s, {abs(value - side):.3g}.",
                 "A plan satisfies the equations of motion and the conditions at both ends.",
                 do="Choose a greater weight, a longer span, or a start and an end nearer to the program.",
-                row=row, t=t, violation=float(abs(value - side)), **facts,
-            )  # fmt: skip
+                row=row,
+                t=t,
+                violation=float(abs(value - side)),
+                **facts,
+            )
         row, t, value, side = self._violation(nlp, without[0], bounds)
         kind = LimitExceeded if status == "Infeasible_Problem_Detected" else IntegrationStopped
         return kind(
@@ -343,8 +355,12 @@ class Relaxation(Transfer):
             f"beyond {side:.5g}.",
             "A plan keeps all limits from end to end.",
             do="Widen this limit, choose a greater weight, or give the transition more time.",
-            row=row, t=t, value=value, limit=side, **facts,
-        )  # fmt: skip
+            row=row,
+            t=t,
+            value=value,
+            limit=side,
+            **facts,
+        )
 
     def _violation(self, nlp, w, bounds):
         """Name, instant [s], value and side of what violates its bounds most, relative to its size, in SI."""
@@ -415,10 +431,15 @@ class Relaxation(Transfer):
             model = model.near(t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
         run = Run(
-            t, jets, tuple(model.jet_names), model, "relaxed", counters=counters,
+            t,
+            jets,
+            tuple(model.jet_names),
+            model,
+            "relaxed",
+            counters=counters,
             knots=tuple(plan.pieces.edges[1:-1].tolist()),
             start=State(float(t[0]), x[:, 0].copy(), tuple(model.state_names), (), (), 0.0),
-        )  # fmt: skip
+        )
         missed = ", ".join(f"{name} {np.abs(run.residual[name]).max():.2g}" for name in self.program.names)
         begins = "" if self.opening is None else "begins on its bounded motion; "
         return replace(run, message=f"finished; {begins}the program is missed by at most {missed}{self._exceeded(run)}")

@@ -150,8 +150,11 @@ class Transfer:
             f"{high[worst]:g}.",
             "The inputs that hold the machine at rest lie within the limits.",
             nearest=f"A limit of at least {abs(u[worst]):.6g}.",
-            name=name, t=t, value=float(u[worst]), limit=(float(low[worst]), float(high[worst])),
-        )  # fmt: skip
+            name=name,
+            t=t,
+            value=float(u[worst]),
+            limit=(float(low[worst]), float(high[worst])),
+        )
 
     def _require_standing(self, t, where):
         """Refuse a program that moves at an instant at which the plant rests."""
@@ -174,8 +177,10 @@ class Transfer:
                 f"{' 1/s' if orders[name] <= 0 else ''}.",
                 "Where the plant rests, the program does, too.",
                 do="Choose a span between rests of the program, or end='free' and a start with its velocities.",
-                name=name, t=float(t), rate=float(at[np.argmax(moved)]),
-            )  # fmt: skip
+                name=name,
+                t=float(t),
+                rate=float(at[np.argmax(moved)]),
+            )
 
     def _target(self):
         """What is fixed at the end: (state with NaN where open, inputs or None, function that vanishes or None)."""
@@ -269,8 +274,11 @@ class Transfer:
                         f"At the {where}, t = {t[k]:g} s, {name} = {value:.6g}; its bound is ({low:g}, {high:g}).",
                         "The states at both ends lie within the bounds.",
                         do=f"Widen the bound, or choose another {where}.",
-                        name=name, t=float(t[k]), value=float(value), limit=(low, high),
-                    )  # fmt: skip
+                        name=name,
+                        t=float(t[k]),
+                        value=float(value),
+                        limit=(low, high),
+                    )
 
     def _independent(self, rest, held):
         """A function of (t, x, v) whose values vanish at rests near this one, without dependent rows."""
@@ -393,8 +401,11 @@ def _no_rest(where, t, worst):
         f"There is no rest at the {where}, t = {t:g} s, at which the program is met: {row} remains {value:.3g}.",
         "The plan begins and ends at rest where start or end do not say otherwise.",
         do="Give coordinates near the rest in start={...}, or end='free'.",
-        where=where, t=float(t), row=row, value=value,
-    )  # fmt: skip
+        where=where,
+        t=float(t),
+        row=row,
+        value=value,
+    )
 
 
 def _no_equilibrium(t, worst, speeds):
@@ -405,5 +416,8 @@ def _no_equilibrium(t, worst, speeds):
         f"The start at t = {t:g} s is no equilibrium: {what}.",
         "With end='rest' the plan leaves a rest, at which inputs hold the machine.",
         do="Leave start= out, or write end='free' or the values of states at the end.",
-        t=float(t), row=row, value=value, speeds=moving,
-    )  # fmt: skip
+        t=float(t),
+        row=row,
+        value=value,
+        speeds=moving,
+    )

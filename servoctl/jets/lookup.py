@@ -85,7 +85,6 @@ class Lookup:
             return 1.0 * np.searchsorted(self.numbers, np.asarray(s, dtype=float), "right")
         return self.numbers[np.clip(np.nan_to_num(np.asarray(s, dtype=float)), 0, len(self.numbers) - 1).astype(int)]
 
-
     def called(self, s):
         """The value at an SX scalar, without the `floor` that has no derivative."""
         return self.function.call([s])[0]

@@ -14,14 +14,25 @@ from servoctl.jets.tape import Node
 FEWEST = 2  # knots from which on a search takes no longer than sums
 
 _STEPWISE = {
-    ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply, ca.OP_DIV: np.divide, ca.OP_NEG: np.negative,
-    ca.OP_SQ: np.square, ca.OP_TWICE: lambda a: 2.0 * a, ca.OP_INV: lambda a: 1.0 / a,
-}  # fmt: skip
+    ca.OP_ADD: np.add,
+    ca.OP_SUB: np.subtract,
+    ca.OP_MUL: np.multiply,
+    ca.OP_DIV: np.divide,
+    ca.OP_NEG: np.negative,
+    ca.OP_SQ: np.square,
+    ca.OP_TWICE: lambda a: 2.0 * a,
+    ca.OP_INV: lambda a: 1.0 / a,
+}
 
 
 _OF_NODES = {
-    "add": ca.OP_ADD, "sub": ca.OP_SUB, "mul": ca.OP_MUL, "div": ca.OP_DIV, "neg": ca.OP_NEG, "sq": ca.OP_SQ,
-}  # fmt: skip
+    "add": ca.OP_ADD,
+    "sub": ca.OP_SUB,
+    "mul": ca.OP_MUL,
+    "div": ca.OP_DIV,
+    "neg": ca.OP_NEG,
+    "sq": ca.OP_SQ,
+}
 
 
 class Constant(NamedTuple):

@@ -26,15 +26,35 @@ if hasattr(ca.GlobalOptions, "getNumpyMode") and ca.GlobalOptions.getNumpyMode()
     ca.GlobalOptions.setNumpyMode(-1)
 
 _NUMPY = {
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
-    "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh,
-    "tanh": np.tanh, "asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh, "expm1": np.expm1,
-    "log1p": np.log1p, "sign": np.sign, "fabs": np.abs, "atan2": np.arctan2, "power": np.power,
-    "lt": lambda a, b: 1.0 * (a < b), "le": lambda a, b: 1.0 * (a <= b),
-    "eq": lambda a, b: 1.0 * (a == b), "ne": lambda a, b: 1.0 * (a != b),
-    "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)), "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "exp": np.exp,
+    "log": np.log,
+    "sqrt": np.sqrt,
+    "asin": np.arcsin,
+    "acos": np.arccos,
+    "atan": np.arctan,
+    "sinh": np.sinh,
+    "cosh": np.cosh,
+    "tanh": np.tanh,
+    "asinh": np.arcsinh,
+    "acosh": np.arccosh,
+    "atanh": np.arctanh,
+    "expm1": np.expm1,
+    "log1p": np.log1p,
+    "sign": np.sign,
+    "fabs": np.abs,
+    "atan2": np.arctan2,
+    "power": np.power,
+    "lt": lambda a, b: 1.0 * (a < b),
+    "le": lambda a, b: 1.0 * (a <= b),
+    "eq": lambda a, b: 1.0 * (a == b),
+    "ne": lambda a, b: 1.0 * (a != b),
+    "logic_and": lambda a, b: 1.0 * ((a != 0) & (b != 0)),
+    "logic_or": lambda a, b: 1.0 * ((a != 0) | (b != 0)),
     "logic_not": lambda a: 1.0 * (a == 0),
-}  # fmt: skip
+}
 _CASADI = {name: getattr(ca, name) for name in _NUMPY} | {"erf": ca.erf}
 
 
@@ -101,20 +121,43 @@ _BINARY = {ca.OP_FMIN: "fmin", ca.OP_FMAX: "fmax", ca.OP_IF_ELSE_ZERO: "gate"}
 _ARITHMETIC_NODES = {ca.OP_ADD: "add", ca.OP_SUB: "sub", ca.OP_MUL: "mul", ca.OP_DIV: "div"}
 _UNARY = {ca.OP_NEG: "neg", ca.OP_SQ: "sq", ca.OP_SQRT: "sqrt", ca.OP_FABS: "fabs", ca.OP_ASSIGN: "copy"}
 _CONSTANT = {  # piecewise constant: their derivatives are zero
-    ca.OP_LT: "lt", ca.OP_LE: "le", ca.OP_EQ: "eq", ca.OP_NE: "ne", ca.OP_AND: "logic_and", ca.OP_OR: "logic_or",
-    ca.OP_NOT: "logic_not", ca.OP_SIGN: "sign",
-}  # fmt: skip
+    ca.OP_LT: "lt",
+    ca.OP_LE: "le",
+    ca.OP_EQ: "eq",
+    ca.OP_NE: "ne",
+    ca.OP_AND: "logic_and",
+    ca.OP_OR: "logic_or",
+    ca.OP_NOT: "logic_not",
+    ca.OP_SIGN: "sign",
+}
 _TRUTHS = {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT}
 _FUNCTION = {  # y' = sum of g * a' with y_0 = f(a_0): each is one "quadrature" node
-    ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_ASIN: "asin",
-    ca.OP_ACOS: "acos", ca.OP_ATAN: "atan", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_TANH: "tanh",
-    ca.OP_ASINH: "asinh", ca.OP_ACOSH: "acosh", ca.OP_ATANH: "atanh", ca.OP_EXPM1: "expm1", ca.OP_LOG1P: "log1p",
+    ca.OP_EXP: "exp",
+    ca.OP_LOG: "log",
+    ca.OP_SIN: "sin",
+    ca.OP_COS: "cos",
+    ca.OP_TAN: "tan",
+    ca.OP_ASIN: "asin",
+    ca.OP_ACOS: "acos",
+    ca.OP_ATAN: "atan",
+    ca.OP_SINH: "sinh",
+    ca.OP_COSH: "cosh",
+    ca.OP_TANH: "tanh",
+    ca.OP_ASINH: "asinh",
+    ca.OP_ACOSH: "acosh",
+    ca.OP_ATANH: "atanh",
+    ca.OP_EXPM1: "expm1",
+    ca.OP_LOG1P: "log1p",
     ca.OP_ERF: "erf",
-}  # fmt: skip
+}
 _REFUSED = {
-    ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil", ca.OP_FMOD: "fmod", ca.OP_REMAINDER: "remainder",
-    ca.OP_COPYSIGN: "copysign", ca.OP_ERFINV: "erfinv",
-}  # fmt: skip
+    ca.OP_FLOOR: "floor",
+    ca.OP_CEIL: "ceil",
+    ca.OP_FMOD: "fmod",
+    ca.OP_REMAINDER: "remainder",
+    ca.OP_COPYSIGN: "copysign",
+    ca.OP_ERFINV: "erfinv",
+}
 _GROWING = {"exp", "expm1", "sinh", "cosh"}  # functions that leave the range of doubles
 _OPTIONS = {"allow_free": True, "live_variables": False, "max_io": 10**9}  # operations fill new places in order
 

@@ -470,8 +470,10 @@ class Watch:
         if self.residuals is None or not self.residuals.m:
             self.tolerance.accept(stretch.x)
             return None
-        picked = np.unique(np.linspace(0, count, MOST_INSPECTED + 1).astype(int)) if count > MOST_INSPECTED else (
-            np.arange(count + 1)
+        picked = (
+            np.unique(np.linspace(0, count, MOST_INSPECTED + 1).astype(int))
+            if count > MOST_INSPECTED
+            else (np.arange(count + 1))
         )
         t, x = stretch.t[picked], stretch.x[:, picked]
         ends = stretch.dense(np.arange(count), stretch.t[1:]) if projected else stretch.x[:, 1:]

@@ -52,8 +52,11 @@ MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the s
 
 
 def derive(
-    mechanism: Mechanism, program: Program, guess: Mapping[str, float] | None = None, keep: Sequence[str] = (),
-) -> "Model":  # fmt: skip
+    mechanism: Mechanism,
+    program: Program,
+    guess: Mapping[str, float] | None = None,
+    keep: Sequence[str] = (),
+) -> "Model":
     """Derive the reduced dynamics and the required actuation of a mechanism under its program (3.18).
 
     Parameters
@@ -691,9 +694,13 @@ class Model(Detailed):
         return {name: f.operations for name, f in (self._functions | signals).items() if isinstance(f, Compiled)}
 
     def start(
-        self, /, t: float = 0.0, guess: Mapping[str, float] | None = None,
-        hold: Mapping[str, ca.SX] | None = None, **held: float,
-    ) -> State:  # fmt: skip
+        self,
+        /,
+        t: float = 0.0,
+        guess: Mapping[str, float] | None = None,
+        hold: Mapping[str, ca.SX] | None = None,
+        **held: float,
+    ) -> State:
         """Consistent initial values: those passed are fixed, the others follow from the constraints and their rates.
 
         Where several states have the held values, the one nearest to the guess is taken; the printed state names others

@@ -51,8 +51,9 @@ class Rests:
     def of_program(cls, mechanism, forces, program):
         """Those with any actuation, under further forces (n,), of rows that can hold at rest."""
         q, material = mechanism.q, mechanism.constraints
-        B = ca.horzcat(mechanism.E, *(Row(e, max(q.order(e), 0), name, "material").gradient(q).T
-                                      for name, e in material.items()))  # fmt: skip
+        B = ca.horzcat(
+            mechanism.E, *(Row(e, max(q.order(e), 0), name, "material").gradient(q).T for name, e in material.items())
+        )
         return cls(mechanism, mechanism.balance - forces, B, {**material, **program.residuals})
 
     def measured(self, t, z, p):

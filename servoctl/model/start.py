@@ -577,9 +577,11 @@ def _not_found(equations, x, residuals):
     value, jacobian = (each[worst] for each in equations(x))
     name, lacks = equations.rows[worst], "" if np.isfinite(value) else "value"
     lacks = lacks or ("" if np.isfinite(jacobian).all() and jacobian.any() else "gradient")
-    end = f"where the invariant {name!r} has no {lacks}" if lacks else (
-        f"with the residual {residuals[worst]:.2e} of the invariant {name!r}"
-    )  # fmt: skip
+    end = (
+        f"where the invariant {name!r} has no {lacks}"
+        if lacks
+        else (f"with the residual {residuals[worst]:.2e} of the invariant {name!r}")
+    )
     return InconsistentStart(
         f"The search for a consistent start ended {end}.",
         "A start satisfies every constraint and its time derivatives.",

@@ -27,9 +27,16 @@ from servoctl.values import Value, frozen
 
 
 def plant(
-    mechanism: Mechanism, *, forces=None, damping=None, limits=None, rate_limits=None, lag=None, delay=0.0,
+    mechanism: Mechanism,
+    *,
+    forces=None,
+    damping=None,
+    limits=None,
+    rate_limits=None,
+    lag=None,
+    delay=0.0,
     **parameters: float,
-) -> "Plant":  # fmt: skip
+) -> "Plant":
     """Make the plant of a mechanism: the machine that a controller acts on.
 
     Plants of the same mechanism and forces share their equations, so that other numbers take no time, unless with these
@@ -84,9 +91,18 @@ def plant(
     numbers = np.concatenate([values, [damping[names[i]] for i in damped], rates])
     state_names = (*mechanism.q.names, *mechanism.q.jet_names(1), *(actuators[i] for i in lagged))
     return Plant(
-        mechanism, numbers, state_names, actuators, tuple(names), _limits(limits, actuators, mechanism.passive),
-        rate_limits, lag, {n: d for n, d in delay.items() if d}, damping, equations,
-    )  # fmt: skip
+        mechanism,
+        numbers,
+        state_names,
+        actuators,
+        tuple(names),
+        _limits(limits, actuators, mechanism.passive),
+        rate_limits,
+        lag,
+        {n: d for n, d in delay.items() if d},
+        damping,
+        equations,
+    )
 
 
 def part_of(whole, mechanism):
@@ -117,10 +133,12 @@ def part_of(whole, mechanism):
     by_actuator = ("limits", "rate_limits", "lag", "delay")
     numbers = {what: {n: v for n, v in getattr(whole, what).items() if n in part.actuators} for what in by_actuator}
     return plant(
-        part, forces={name: forces[name] for name in names if not forces[name].is_zero()},
-        damping={name: c for name, c in whole.damping.items() if name in names}, **numbers,
+        part,
+        forces={name: forces[name] for name in names if not forces[name].is_zero()},
+        damping={name: c for name, c in whole.damping.items() if name in names},
+        **numbers,
         **dict(zip(part.parameters.names, whole.parameters.tolist(), strict=False)),
-    )  # fmt: skip
+    )
 
 
 @frozen(eq=False)
@@ -227,9 +245,10 @@ class Plant(Value, Shown):
             raise self.mechanism.no("generalised force or parameter", name, (*self.disturbable, *parameters.names))
         m, place = self.mechanism, parameters.names.index(name)
         kinds = {
-            "the inertia": ca.vec(m.mass), "the kinematics": ca.vertcat(ca.vec(m.q.V), m.q.h, *m.q.invariants.values()),
+            "the inertia": ca.vec(m.mass),
+            "the kinematics": ca.vertcat(ca.vec(m.q.V), m.q.h, *m.q.invariants.values()),
             "the material constraints": ca.vertcat(ca.SX(0, 1), *m.constraints.values()),
-        }  # fmt: skip
+        }
         for what, expression in kinds.items():
             if ca.depends_on(expression, parameters.symbols[place]):
                 raise SpecificationError(

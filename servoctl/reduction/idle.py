@@ -1,6 +1,5 @@
 """Coordinates that play no part in a program: nothing couples them to what it prescribes, drives or reports."""
 
-
 import casadi as ca
 import numpy as np
 

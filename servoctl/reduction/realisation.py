@@ -145,9 +145,15 @@ def _shared(mechanism, program, constraints, independent, points, context):
     P, L = _determined_rows(mechanism, rows, material, points, k)
     A = _inverse_weights(mechanism, program) @ P.T if program.metric == "actuators" else _inertial(mechanism, L)
     realised = _realised(
-        mechanism, constraints, mechanism.E @ A, A, points, reached.dependent,
-        settled=tuple(rows), unreached=reached.independent,
-    )  # fmt: skip
+        mechanism,
+        constraints,
+        mechanism.E @ A,
+        A,
+        points,
+        reached.dependent,
+        settled=tuple(rows),
+        unreached=reached.independent,
+    )
     return realised, points, pivots
 
 

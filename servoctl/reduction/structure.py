@@ -289,9 +289,17 @@ def structure(reduction, t=None, jets=None, values=None, start=None):
     margin = min(reduction.rank.kept, *(local.margin for local in locals_))
     at = tuple(zip(np.asarray(points.t, dtype=float).tolist(), locals_, strict=True))
     return Structure(
-        names, typical.relative_degree, typical.decoupling_rank, typical.zeros_at_infinity, typical.essential_orders,
-        typical.index, margin, kind, at, start,
-    )  # fmt: skip
+        names,
+        typical.relative_degree,
+        typical.decoupling_rank,
+        typical.zeros_at_infinity,
+        typical.essential_orders,
+        typical.index,
+        margin,
+        kind,
+        at,
+        start,
+    )
 
 
 def _without_rounded(locals_, typical, pivots):
@@ -317,9 +325,16 @@ def _by_orders(reduction, names, orders):
     plain = names and reduction.program.by == "ideal" and max(orders) <= 2 and not reduction.hidden
     index = 1 + max(degrees) if plain else None
     return Structure(
-        names, degrees, len(names) if plain else 0, tuple(sorted(degrees)) if plain else (),
-        degrees if plain else (), index, reduction.rank.kept, "ideal", (),
-    )  # fmt: skip
+        names,
+        degrees,
+        len(names) if plain else 0,
+        tuple(sorted(degrees)) if plain else (),
+        degrees if plain else (),
+        index,
+        reduction.rank.kept,
+        "ideal",
+        (),
+    )
 
 
 def points_of(reduction, t, jets, values):

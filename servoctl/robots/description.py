@@ -101,11 +101,13 @@ def described(source):
 def rotation_of(roll, pitch, yaw):
     """The rotation matrix of roll, pitch and yaw [rad] about fixed axes, without entries that are rounding."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    rotation = np.array([
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ])  # fmt: skip
+    rotation = np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
     return without_rounding(rotation)
 
 
@@ -273,14 +275,22 @@ def _joint(node, name, armature):
     limit, dynamics = _one(node, "limit", what), _one(node, "dynamics", what)
     turns = kind in ("continuous", "floating", "planar")
     joint = Joint(
-        name, kind, _link_of(node, "parent", what), _link_of(node, "child", what), rotation, offset,
+        name,
+        kind,
+        _link_of(node, "parent", what),
+        _link_of(node, "child", what),
+        rotation,
+        offset,
         np.zeros(3) if kind in ("fixed", "floating") else _axis(node, what),
         lower=-math.inf if turns else _one_number(limit, "lower", what, 0.0 if limit is not None else -math.inf),
         upper=math.inf if turns else _one_number(limit, "upper", what, 0.0 if limit is not None else math.inf),
-        effort=_one_number(limit, "effort", what, math.inf), velocity=_one_number(limit, "velocity", what, math.inf),
-        damping=_resistance(dynamics, "damping", what), friction=_resistance(dynamics, "friction", what),
-        armature=armature, mimic=_mimic(_one(node, "mimic", what), kind, what),
-    )  # fmt: skip
+        effort=_one_number(limit, "effort", what, math.inf),
+        velocity=_one_number(limit, "velocity", what, math.inf),
+        damping=_resistance(dynamics, "damping", what),
+        friction=_resistance(dynamics, "friction", what),
+        armature=armature,
+        mimic=_mimic(_one(node, "mimic", what), kind, what),
+    )
     if joint.lower > joint.upper:
         raise SpecificationError(
             f"The limits of {what} are lower={joint.lower:g}, upper={joint.upper:g}.",

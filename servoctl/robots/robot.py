@@ -154,9 +154,16 @@ class Robot:
         return np.array(position).ravel(), np.array(rotation)
 
     def mechanism(
-        self, constraints=None, actuators=None, *, outputs=None, forces=None, friction=None, armature=None,
+        self,
+        constraints=None,
+        actuators=None,
+        *,
+        outputs=None,
+        forces=None,
+        friction=None,
+        armature=None,
         parameters=None,
-    ) -> Mechanism:  # fmt: skip
+    ) -> Mechanism:
         """The mechanism of the robot: its balance by the recursive Newton-Euler scheme, gravity and damping.
 
         Figures show each link as a line from the frame of the link that carries it to its own. Efforts and positions of

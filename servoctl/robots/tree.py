@@ -20,9 +20,7 @@ class Placement:
 
     def __matmul__(self, inner):
         """The placement of a frame that is placed in this one."""
-        return Placement(
-            without_rounding(self.rotation @ inner.rotation), self.offset + self.rotation @ inner.offset
-        )  # fmt: skip
+        return Placement(without_rounding(self.rotation @ inner.rotation), self.offset + self.rotation @ inner.offset)
 
 
 @frozen

@@ -432,11 +432,18 @@ def _identified(plant, fit, sizes):
     sizes = np.where(sizes > 0, sizes, 1.0)
     covariance, deviations, unseen = _determined(problem.names, J[:, : problem.k] * sizes, J[:, problem.k :])
     return Identification(
-        problem.names, theta, deviations * sizes, covariance * np.outer(sizes, sizes), unseen, fit.misfit,
-        problem.first_states(x), problem.by_name(x),
-        _with_numbers(plant, _numbers(plant, problem.names, x[: problem.k])), fit.status > 0,
+        problem.names,
+        theta,
+        deviations * sizes,
+        covariance * np.outer(sizes, sizes),
+        unseen,
+        fit.misfit,
+        problem.first_states(x),
+        problem.by_name(x),
+        _with_numbers(plant, _numbers(plant, problem.names, x[: problem.k])),
+        fit.status > 0,
         _message(fit, unseen),
-    )  # fmt: skip
+    )
 
 
 def _message(fit, unseen):

@@ -143,9 +143,7 @@ def _growth_in_words(number):
     return "1 %" if number else "0.01"
 
 
-def sensitivity(
-    run: Run, of: str | Sequence[str] | None = None, to: str | Sequence[str] | None = None
-) -> Sensitivity:
+def sensitivity(run: Run, of: str | Sequence[str] | None = None, to: str | Sequence[str] | None = None) -> Sensitivity:
     """Derivatives of a run's signals by parameters and initial values, without differences.
 
     Where the program determines the motion they follow from the implicit function theorem at each sample, otherwise
@@ -341,9 +339,14 @@ def _integrated(model, run, names, S):
         f = variational(variant, names, K - len(names))
         inside = np.flatnonzero((forward * run.t >= forward * a) & (forward * run.t <= forward * b))
         solved = solve_ivp(
-            lambda t, z, f=f, p=variant.parameters: f(t, z, p), (a, b), y, method, dense_output=True,
-            rtol=RTOL, atol=atol,
-        )  # fmt: skip
+            lambda t, z, f=f, p=variant.parameters: f(t, z, p),
+            (a, b),
+            y,
+            method,
+            dense_output=True,
+            rtol=RTOL,
+            atol=atol,
+        )
         if solved.status:
             raise _ended(float(solved.t[-1]), solved.message)
         if len(inside):

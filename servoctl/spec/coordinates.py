@@ -201,9 +201,10 @@ class Coordinates:
         other.units = {name: u for name, u in self.units.items() if name in (*other.names, *other.velocity_names)}
         known = {s.element_hash() for s in other._q}
         other.invariants = {
-            name: value for name, value in self.invariants.items()
+            name: value
+            for name, value in self.invariants.items()
             if {s.element_hash() for s in ca.symvar(value)} & known
-        }  # fmt: skip
+        }
         at = dict(zip(places, range(len(places)), strict=True))
         other.spheres = tuple((tuple(at[i] for i in e), square) for e, square in self.spheres if set(e) <= set(at))
         other._whole, other.identity = (self, tuple(velocities)), self.identity

@@ -165,9 +165,18 @@ class Mechanism(Shown):
         q, p = self.q, self.parameters
         names = [q.names, q.velocity_names, q.plain, list(q.invariants), self.actuators, list(self.constraints)]
         expressions = [
-            q.V, q.h, *q.invariants.values(), self.balance, self.energy, self.forces, self.E,
-            *self.constraints.values(), *self.followers.values(), *self.outputs.values(), *self.shapes.values(),
-        ]  # fmt: skip
+            q.V,
+            q.h,
+            *q.invariants.values(),
+            self.balance,
+            self.energy,
+            self.forces,
+            self.E,
+            *self.constraints.values(),
+            *self.followers.values(),
+            *self.outputs.values(),
+            *self.shapes.values(),
+        ]
         function = as_text(q.as_function([*expressions, *self.reported.values()], p.symbols))
         facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
         facts += [p.defaults, self.left_out, self.units, self.limits]
@@ -276,11 +285,19 @@ class Mechanism(Shown):
         """
         driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
         driven = Mechanism(
-            self.q, self._gibbs, self.potential, None, self.parameters, kinetic=self._kinetic,
-            balance=self._inverse_dynamics, mass=self._mass, forces=self._applied - self._added + forces + driving,
-            constraints=self.constraints, outputs={**self.outputs, **inputs},
+            self.q,
+            self._gibbs,
+            self.potential,
+            None,
+            self.parameters,
+            kinetic=self._kinetic,
+            balance=self._inverse_dynamics,
+            mass=self._mass,
+            forces=self._applied - self._added + forces + driving,
+            constraints=self.constraints,
+            outputs={**self.outputs, **inputs},
             shapes={name: ca.horzsplit(points) for name, points in self.shapes.items()},
-        )  # fmt: skip
+        )
         driven.inputs, driven.reported = tuple(inputs), driven._named(reported, "residual")
         driven.units, driven.limits = self.units, self.limits
         driven.longer, driven.followers, driven.passive = self.longer, self.followers, self.passive
@@ -341,12 +358,13 @@ class Mechanism(Shown):
         curvature = ca.jacobian(ca.vec(self.mass), acceleration)
         if curvature.nnz() and not self.is_zero(curvature.nonzeros()):
             raise SpecificationError(
-                "The Gibbs function is not quadratic in the accelerations." if self._gibbs is not None
+                "The Gibbs function is not quadratic in the accelerations."
+                if self._gibbs is not None
                 else "The balance is not linear in the accelerations.",
                 "S = Σ m a·a/2 is quadratic in γ'', so that ∂S/∂γ'' is linear (3.8).",
                 do="Build S by sv.particle and sv.rigid_body, or check the powers of the second derivatives.",
                 source="balance" if self._gibbs is None else "gibbs",
-            )  # fmt: skip
+            )
         self._refuse_asymmetry()
         if self._kinetic is not None and given:
             w, what = ca.vertcat(*self.q.gamma(1)), "Gibbs function" if self._inverse_dynamics is None else "balance"

@@ -28,9 +28,14 @@ SEEDS = 2**31  # seeds of cases are below this
 
 
 def close_many(
-    run: Closed, cases: Mapping[str, ArrayLike] | Sequence[Mapping[str, float]], *,
-    scale: Mapping[str, str] | None = None, record: Sequence[str] = (), every: int = 1, executor: int | None = None,
-) -> Batch:  # fmt: skip
+    run: Closed,
+    cases: Mapping[str, ArrayLike] | Sequence[Mapping[str, float]],
+    *,
+    scale: Mapping[str, str] | None = None,
+    record: Sequence[str] = (),
+    every: int = 1,
+    executor: int | None = None,
+) -> Batch:
     """Run a closed loop thousands of times, with different numbers in each case.
 
     The loops run in compiled code, in the lanes of vectors and on threads; without a compiler one after the other. The
@@ -91,9 +96,14 @@ def close_many(
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
     meta = {
-        "t_span": [loop.t0, loop.t0 + loop.samples * loop.period], "by": run.law.name, "rate": run.law.rate,
-        "substeps": loop.substeps, "delay": loop.delay, "machine": machine(), "units": run.units,
-    }  # fmt: skip
+        "t_span": [loop.t0, loop.t0 + loop.samples * loop.period],
+        "by": run.law.name,
+        "rate": run.law.rate,
+        "substeps": loop.substeps,
+        "delay": loop.delay,
+        "machine": machine(),
+        "units": run.units,
+    }
     reasons = _reasons(run, loop, numbers, seeds, gathered) if run.law.allocation else {}
     study, gathered = _study(columns, seeds, derived.names, gathered, meta, reasons)
     t = loop.t0 + np.arange(len(gathered.trace)) * every * loop.period
@@ -278,10 +288,15 @@ def _one(run, loop, constants, start, factors, seed):
     conditions = run.conditions
     forces = zip(conditions.disturbance.items(), factors, strict=True)
     return close(
-        replace(run.plant, parameters=constants), run.law, start, (loop.t0, loop.t0 + loop.samples * loop.period),
-        sensors=replace(conditions.sensors, seed=seed), timing=Timing(delay=loop.delay, substeps=loop.substeps),
-        disturbance={name: _scaled(force, factor) for (name, force), factor in forces}, plan=run.plan,
-    )  # fmt: skip
+        replace(run.plant, parameters=constants),
+        run.law,
+        start,
+        (loop.t0, loop.t0 + loop.samples * loop.period),
+        sensors=replace(conditions.sensors, seed=seed),
+        timing=Timing(delay=loop.delay, substeps=loop.substeps),
+        disturbance={name: _scaled(force, factor) for (name, force), factor in forces},
+        plan=run.plan,
+    )
 
 
 def _scaled(f, factor):

@@ -31,10 +31,16 @@ SHARES = 16  # of the cases, which the workers of an executor share
 
 
 def simulate_many(
-    model: Model, starts: State | ArrayLike | Mapping[str, ArrayLike], parameters: Mapping[str, ArrayLike] | None,
-    t_span: Sequence[float], method: Method | str | None = None, *, t_eval: ArrayLike | None = None,
-    executor: Executor | int | None = None, progress: bool | None = None,
-) -> Batch:  # fmt: skip
+    model: Model,
+    starts: State | ArrayLike | Mapping[str, ArrayLike],
+    parameters: Mapping[str, ArrayLike] | None,
+    t_span: Sequence[float],
+    method: Method | str | None = None,
+    *,
+    t_eval: ArrayLike | None = None,
+    executor: Executor | int | None = None,
+    progress: bool | None = None,
+) -> Batch:
     """Simulate the motion of a program for many starts and sets of parameters.
 
     By the Taylor method the motions run in compiled code, in the lanes of vectors with steps of their own, and on

@@ -19,11 +19,20 @@ def of_run(run):
     """Sentences on a run with its model, those that hold."""
     mechanism, steps, count = run.model.reduction.mechanism, run.counters.get("steps", 0), len(run.t)
     grown = {} if callable(run.verdict) else run.verdict  # known where there is something to know
-    return tuple(filter(None, [
-        first_transient(run, partial(simulated, run.model)), *_heavy(run, mechanism), *_past_limits(run, mechanism),
-        grown["text"] if grown.get("verdict") == "unstable" else "",
-        f"{steps:,} steps for {count:,} samples (t_eval): peaks may lie between" if steps > TIMES * count else "",
-    ]))  # fmt: skip
+    return tuple(
+        filter(
+            None,
+            [
+                first_transient(run, partial(simulated, run.model)),
+                *_heavy(run, mechanism),
+                *_past_limits(run, mechanism),
+                grown["text"] if grown.get("verdict") == "unstable" else "",
+                f"{steps:,} steps for {count:,} samples (t_eval): peaks may lie between"
+                if steps > TIMES * count
+                else "",
+            ],
+        )
+    )
 
 
 def of_loop(closed):
