@@ -61,7 +61,6 @@ from servoctl.robots.robot import Frame as Frame
 from servoctl.robots.robot import Robot as Robot
 from servoctl.robots.robot import urdf as urdf
 from servoctl.run import Run as Run
-from servoctl.run import load as load
 from servoctl.sensitivities.identification import Identification as Identification
 from servoctl.sensitivities.identification import identify as identify
 from servoctl.sensitivities.sensitivity import Sensitivity as Sensitivity
@@ -83,7 +82,7 @@ from servoctl.study.batch import Batch as Batch
 from servoctl.study.cases import grid as grid
 from servoctl.study.cases import monte_carlo as monte_carlo
 from servoctl.study.close_many import close_many as close_many
-from servoctl.study.load import load_study as load_study
+from servoctl.study.load import load as load
 from servoctl.study.many import simulate_many as simulate_many
 from servoctl.study.stability_map import StabilityMap as StabilityMap
 from servoctl.study.stability_map import stability as stability

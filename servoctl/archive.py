@@ -21,7 +21,7 @@ def writing(path, what, folder=False):
 
     `what` names the content: "run", "study", "figures".
     """
-    path = as_path(path, f"The path of the {what}")
+    path = as_path(path, "The path of what was saved")
     try:
         (path if folder else path.parent).mkdir(parents=True, exist_ok=True)
         yield path
@@ -36,7 +36,7 @@ def writing(path, what, folder=False):
 
 def save(path, what, facts, arrays):
     """Write arrays and JSON-able facts as npz and return the path; a missing suffix is added."""
-    path = _suffixed(as_path(path, f"The path of the {what}"))
+    path = _suffixed(as_path(path, "The path of what was saved"))
     with writing(path, what):
         np.savez_compressed(path, meta=np.array(json.dumps({"format": FORMAT, **facts})), **arrays)
     return path
@@ -89,12 +89,12 @@ def _suffixed(path):
     return path if path.suffix == SUFFIX else Path(f"{path}{SUFFIX}")
 
 
-def read(path, what, build):
-    """`build(facts, arrays)` of an archive; `ServoError` if the file is damaged or not one of this kind.
+def read(path, build):
+    """`build(facts, arrays)` of an archive; `ServoError` if the file is damaged or no archive.
 
     A missing suffix is added where there is no file without it.
     """
-    path = as_path(path, f"The path of the {what}")
+    path = as_path(path, "The path of what was saved")
     try:
         path = path if path.is_file() else _suffixed(path)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:  # NumPy leaves damaged ones open
@@ -104,10 +104,9 @@ def read(path, what, build):
     except Exception as error:  # of zip, zlib, numpy or json, or from what a damaged file says
         why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise ServoError(
-            f"{path} cannot be read as a {what}: {why[:MOST_LETTERS]}.",
-            f"A {what} is read from an npz file that {what.capitalize()}.save wrote.",
+            f"{path} cannot be read: {why[:MOST_LETTERS]}.",
+            "It is no npz file that `save` of a run, a loop or a study wrote, or not a whole one.",
             path=str(path),
-            what=what,
         ) from error
 
 

@@ -540,32 +540,6 @@ class _Residuals(Mapping):
         return stored[name]
 
 
-def load(path, model=None) -> Run:
-    """A run from a file that `Run.save` wrote.
-
-    Parameters
-    ----------
-    path : str or Path
-        A missing suffix .npz is added.
-    model : Model, optional
-        The model of the run, derived again: with it the run can be verified, interpolated, and made a law of.
-
-    Returns
-    -------
-    Run
-        With its samples, signals and residuals, and with the model.
-
-    Raises
-    ------
-    ServoError
-        If the file is missing or was not written by `Run.save`.
-    SpecificationError
-        If the run is not of this model: names, parameters, or values of signals differ.
-    """
-    run, facts = archive.read(path, "run", _from_archive)
-    return run if model is None else _of_model(run, facts, model)
-
-
 def _facts_of_start(start):
     if start is None:
         return None
@@ -579,7 +553,8 @@ def _facts_of_model(run):
     return {"parameters": run.model.numbers, "variants": variants}
 
 
-def _from_archive(facts, arrays):
+def as_saved(facts, arrays):
+    """The run of an archive, without its model."""
     for name, kind in FACTS.items():
         archive.require(type(facts[name]) is kind, f"its {name} is {facts[name]!r}")
     t = archive.numbers(arrays, "t", None)
@@ -595,7 +570,7 @@ def _from_archive(facts, arrays):
     own = {name: tuple(facts[name]) if kind is list else facts[name] for name, kind in FACTS.items()}
     own["verdict"], own["stored_units"] = own.pop("internal"), own.pop("units")
     events = {name: _event_at(arrays, i, own) for i, name in enumerate(archive.named(facts["events"]))}
-    return Run(t, jets, stored=signals, stored_residual=residuals, start=start, events=events, **own), facts
+    return Run(t, jets, stored=signals, stored_residual=residuals, start=start, events=events, **own)
 
 
 def _event_at(arrays, i, own):
@@ -605,7 +580,7 @@ def _event_at(arrays, i, own):
     return Run(t, jets, own["jet_names"][: len(jets)], stored_units=own["stored_units"])
 
 
-def _of_model(run, facts, model):
+def of_model(run, facts, model):
     """A loaded run with its model, which must give the signals of the file."""
     if not hasattr(model, "signal_groups"):
         raise SpecificationError(

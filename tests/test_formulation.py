@@ -11,7 +11,7 @@ import servoctl as sv
 from benchmarks.literature.formulations import NAMES, FormulationCost, formulation, formulation_cost
 from benchmarks.literature.guided_arm import guided_arm
 from servoctl.gallery import gallery
-from servoctl.study.load import load_study
+from servoctl.study.load import load
 
 DOC = Path(__file__).parents[1] / "docs" / "formulations.md"
 JOINTS = [(2, 1), (4, 1), (4, 2), (4, 3), (8, 1), (8, 4), (8, 7)]
@@ -92,7 +92,7 @@ def test_times_are_measured_where_they_are_asked_for(joints):
 
 
 def test_a_cost_is_a_study_that_saves_and_draws(joints, tmp_path):
-    again = load_study(joints.save(tmp_path / "cost"))
+    again = load(joints.save(tmp_path / "cost"))
     assert FormulationCost(again.kind, again.columns, again.meta).table() == joints.table()
     assert len(repr(joints).splitlines()) <= 12
     counts, times = joints.plot().axes

@@ -323,7 +323,7 @@ def test_the_front_and_the_advice_follow_from_the_rows(three):
 
 
 def test_a_study_of_models_is_saved_printed_and_drawn(three, tmp_path):
-    again = sv.load_study(three.save(tmp_path / "models"))
+    again = sv.load(three.save(tmp_path / "models"))
     assert type(again) is sv.TradeOff and repr(again) == repr(three)
     lines = repr(three).splitlines()
     assert len(lines) <= 12 and max(map(len, lines)) <= 120 and lines[4].split()[0] == "model"

@@ -10,7 +10,7 @@ from refusals import refused
 import servoctl as sv
 from benchmarks.literature.servo_dae import FORMS, DaeComparison, dae_comparison, servo_dae
 from servoctl.gallery import gallery
-from servoctl.study.load import load_study
+from servoctl.study.load import load
 
 DOC = Path(__file__).parents[1] / "docs" / "servo_dae.md"
 SCENES = ["overhead-crane", "crane-3d-redundant", "two-cars", "mass-on-car-absolute", "appell-hamel", "vtol"]
@@ -118,7 +118,7 @@ def test_a_hoisted_load_is_lost_in_relative_coordinates_and_found_in_redundant_o
 def test_a_comparison_is_a_study_that_prints_saves_and_draws(gallery_model, tmp_path):
     study = compared(gallery_model("two-cars"), "two-cars", [0.1, 0.05])
     assert len(study) == 8 and len(repr(study).splitlines()) <= 12
-    again = load_study(study.save(tmp_path / "dae"))
+    again = load(study.save(tmp_path / "dae"))
     again = DaeComparison(again.kind, again.columns, again.meta)
     assert again.best("servo") == pytest.approx(study.best("servo"), nan_ok=True)
     assert np.array_equal(again["force"], study["force"])

@@ -286,7 +286,7 @@ def test_a_run_gives_extrema_final_values_and_its_residual(gallery_model):
 def test_a_study_is_saved_loaded_and_given_to_xarray(tmp_path):
     xarray = needs("xarray")
     study = sv.sweep(picky, sv.grid(m=[1, 2, 3, 4]))
-    loaded = sv.load_study(study.save(tmp_path / "study"))
+    loaded = sv.load(study.save(tmp_path / "study"))
     assert same(study, loaded) and loaded.meta == study.meta
     study.to_xarray().to_netcdf(tmp_path / "study.nc")
     with xarray.open_dataset(tmp_path / "study.nc") as data:

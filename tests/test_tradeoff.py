@@ -15,7 +15,7 @@ from servoctl.methods.accuracy import motion_error
 from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.methods.choice import as_method
 from servoctl.shell.main import main
-from servoctl.study.load import load_study
+from servoctl.study.load import load
 from servoctl.study.table import Study
 from servoctl.study.tradeoff import TOLERANCES as DEFAULTS
 from servoctl.study.tradeoff import TradeOff
@@ -214,7 +214,7 @@ def test_a_recommended_treatment_is_the_measured_one(drift):
 
 
 def test_a_study_is_read_back(study, tmp_path):
-    again = load_study(study.save(tmp_path / "trade"))
+    again = load(study.save(tmp_path / "trade"))
     assert type(again) is TradeOff and again.meta == study.meta and repr(again) == repr(study)
     for name in study.columns:
         np.testing.assert_array_equal(again[name], study[name])
@@ -239,7 +239,7 @@ def test_a_table_has_even_columns(tmp_path):
     with refused(NameUnknown, name="c"):
         table.column("c")
     with refused(ServoError, "none.npz"):
-        load_study(tmp_path / "none.npz")
+        load(tmp_path / "none.npz")
     (tmp_path / "file").write_text("", encoding="utf-8")
     with refused(ServoError, "a.csv"):
         table.csv(tmp_path / "file" / "a.csv")
@@ -319,7 +319,7 @@ def test_the_command_leaves_table_figure_and_advice(tmp_path, monkeypatch, capsy
     facts = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     assert facts["t_span"] == [0.0, 0.5] and facts["recommended"]["method"] in ("Taylor", "RK4")
     assert "Recommended: method=" in capsys.readouterr().out
-    assert set(load_study(folder / "tradeoff.npz")["method"]) == {"Taylor", "RK4"}
+    assert set(load(folder / "tradeoff.npz")["method"]) == {"Taylor", "RK4"}
 
 
 def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, monkeypatch, capsys):

@@ -1,36 +1,48 @@
-"""Studies from files."""
+"""What was saved, from its file."""
 
 from servoctl import archive
-from servoctl.study.table import Study
-from servoctl.study.tradeoff import TradeOff
-
-KINDS = {"tradeoff": TradeOff}  # all others are of class Study
+from servoctl.errors import SpecificationError
+from servoctl.run import Run, as_saved, of_model
 
 
-def load_study(path) -> Study:
-    """Read a study that `Study.save` wrote.
+def load(path, model=None):
+    """What `save` of a run, a closed loop or a study wrote.
 
     Parameters
     ----------
     path : str or Path
+        A missing suffix .npz is added.
+    model : Model, optional
+        The model of a run, derived again: with it the run can be verified, interpolated, and made a law of.
 
     Returns
     -------
-    Study
-        A `TradeOff` if that is what was saved.
+    Run or Study
+        A run with its samples, signals and residuals, and with the model; a closed loop as such a run; or a study, a
+        `TradeOff` if that is what was saved.
 
     Raises
     ------
     ServoError
-        If the file is missing, damaged or no study.
+        If the file is missing, damaged, or was written by something else.
+    SpecificationError
+        If the run is not of this model: names, parameters, or values of signals differ; or a study is given one.
     """
-    return archive.read(path, "study", _from_archive)
+    saved, facts = archive.read(
+        path, lambda facts, arrays: ((_study if "kind" in facts else as_saved)(facts, arrays), facts)
+    )
+    if model is not None and not isinstance(saved, Run):
+        raise SpecificationError(f"{path} holds a study.", "A run alone has a model.", do="Leave out the model.")
+    return saved if model is None else of_model(saved, facts, model)
 
 
-def _from_archive(facts, arrays):
-    kind, meta = facts["kind"], facts["meta"]
-    archive.require(isinstance(kind, str) and isinstance(meta, dict), "its kind or its facts are damaged")
+def _study(facts, arrays):
+    """The study of an archive, of the class that wrote it."""
+    from servoctl.study.table import Study
+    from servoctl.study.tradeoff import TradeOff
+
+    archive.require(isinstance(facts["kind"], str) and isinstance(facts["meta"], dict), "its kind or facts are damaged")
     columns = {name: arrays[f"column_{i}"] for i, name in enumerate(archive.named(facts["names"]))}
-    for name, column in columns.items():
-        archive.require(column.ndim == 1 and column.dtype.kind in "fiubU", f"its column {name!r} is damaged")
-    return KINDS.get(kind, Study)(kind, columns, meta)
+    damaged = [name for name, values in columns.items() if values.ndim != 1 or values.dtype.kind not in "fiubU"]
+    archive.require(not damaged, f"its columns {damaged} are damaged")
+    return (TradeOff if facts["kind"] == "tradeoff" else Study)(facts["kind"], columns, facts["meta"])

@@ -23,7 +23,7 @@ SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 @frozen(eq=False)
 class Study(Shown):
-    """A table of results; made by `tradeoff`, `sweep` or `load_study`.
+    """A table of results; made by `tradeoff`, `sweep` or `load`.
 
     `study["seconds"]` is a column, `study.rows()` a list of dicts, `len(study)` the number of rows.
 
@@ -140,7 +140,7 @@ class Study(Shown):
         return archive.frame(self.columns, self._units_of_names())
 
     def save(self, path):
-        """Save the study as npz, without pickle; `load_study` reads it.
+        """Save the study as npz, without pickle; `load` reads it.
 
         Parameters
         ----------

@@ -190,9 +190,8 @@ class _Checks:
     def __init__(self, run, segments):
         model = run.model
         self.model, self.run, self.notes, self.doubts = model, run, [], []
-        hidden = bool(model.reduction.hidden) and run.method != "algebraic"
         of_series = run.method == "Taylor" and len(run.jets) > len(model.jet_names)
-        self.drifts = of_series or model.reduction.top > 2 or hidden
+        self.drifts = of_series or model.reduction.top > 2 or (model.reduction.hidden and run.method != "algebraic")
         self.stored, self.fresh = run.stored, replace(run, stored={}, stored_residual={})
         self.span = abs(run.t[-1] - run.t[0]) or 1.0
         self.samples = [

@@ -142,7 +142,7 @@ def calls():
         "Study.csv": (study.csv, dict(path=os.path.join(folder, "a.csv"))),
         "Study.save": (study.save, dict(path=os.path.join(folder, "study"))),
         "load": (sv.load, dict(path=plan.save(os.path.join(folder, "plan.npz")))),
-        "load_study": (sv.load_study, dict(path=study.save(os.path.join(folder, "again")))),
+        "load a study": (sv.load, dict(path=study.save(os.path.join(folder, "again")))),
         "export_c": (sv.export_c, dict(source=s["model"], folder=os.path.join(folder, "c"), name="point",
                                        start=s["model"].start())),
         "run.at": (plan.at, dict(t=0.5)),
