@@ -260,13 +260,20 @@ def _rests(model, equations, aim, held, conditions):
 
 
 def _stays(model, t, x):
-    """Whether a state stays from t on or, as where a path begins with a jump, did before; so it does where singular."""
+    """Whether a state stays from t on or, as where a path begins with a jump, did before.
+
+    Where it is singular, and has no rates, the program holds there if nothing moves.
+    """
     if model.flat:
         return True
     f, n_x = model.function("ode").expression, len(model.state_names)
     slow, instants = STILL * (1.0 + np.abs(x[:n_x])), (t, np.nextafter(t, -np.inf))
-    rates = (np.abs(f(at, x[:n_x], model.parameters).full()[:n_x, 0]) for at in instants)
-    return any(not np.any(rate > slow) for rate in rates)
+    rates = [np.abs(f(at, x[:n_x], model.parameters).full()[:n_x, 0]) for at in instants]
+    if np.isfinite(rates).all():
+        return any(np.all(rate <= slow) for rate in rates)
+    residuals = model.signals("residuals")[1]
+    still = residuals.grid([t], np.append(x[:n_x], np.zeros(residuals.n_x - n_x))[:, None], model.parameters)
+    return bool(np.abs(still).max(initial=0.0) <= STILL * (1.0 + np.abs(x[:n_x]).max()))
 
 
 def _split_held(model, held, hold):

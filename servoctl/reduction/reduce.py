@@ -233,16 +233,18 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     times = switches.times(values)
-    if guess is None if near else all(map(_ordinary, filter(None, (guess or {}).values()))):
+    plain, errors = guess is None if near else all(map(_ordinary, filter(None, (guess or {}).values()))), {}
+    for scaled in (not plain,) if near else (not plain, plain):  # a guess far from the origin tells no size
+        scales = usual(mechanism, program, guess or {}, values, partial(_window, times)) if scaled else None
+        if errors and scaled and scales.ordinary:
+            break
         try:
-            return _reduced(mechanism, program, switches, balance, _context(mechanism, times, guess, near, values))
-        except ServoError:
-            scales = None if near else usual(mechanism, program, guess or {}, values, partial(_window, times))
-            if scales is None or scales.ordinary:
-                raise
-    else:
-        scales = usual(mechanism, program, guess, values, partial(_window, times))
-    return _reduced(mechanism, program, switches, balance, _context(mechanism, times, guess, near, values, scales))
+            return _reduced(
+                mechanism, program, switches, balance, _context(mechanism, times, guess, near, values, scales)
+            )
+        except ServoError as error:
+            errors[scaled] = error
+    raise errors.get(True, errors.get(False))
 
 
 def _reduced(*specification):
