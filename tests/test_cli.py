@@ -474,11 +474,11 @@ def test_an_interrupted_verification_keeps_the_run(here, fall, capsys, monkeypat
 
 
 def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch):
-    failed = servoctl.Verification({"acceleration": float("nan")}, ("acceleration",), limits={"acceleration": 1e-6})
+    failed = servoctl.Verification({"balance": float("nan")}, ("balance",), limits={"balance": 1e-6})
     monkeypatch.setattr(servoctl, "verify", lambda *_: failed)
     assert main(["run", fall, "--no-figures"]) == 1
     verification = summary(here / "servoctl-runs" / "fall")["verification"]
-    assert verification == {"verdict": "failed", "passed": False, "numbers": {"acceleration": None}}
+    assert verification == {"verdict": "failed", "passed": False, "numbers": {"balance": None}}
 
 
 def test_an_inconclusive_verification_has_an_exit_code_of_its_own(here, fall, monkeypatch):

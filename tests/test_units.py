@@ -241,7 +241,7 @@ def test_values_are_small_tables_in_a_notebook(plan, loop, table):
         assert shown.startswith("<p><b>") and shown.count("<table>") == shown.count("</table>") >= 1
         assert len(shown) < 8000
     assert "<td>trolley</td>" in plan._repr_html_() and "<td>N</td>" in plan._repr_html_()
-    assert f"<td class=n>{verification.numbers['acceleration']:.2g}</td>" in verification._repr_html_()
+    assert f"<td class=n>{verification.numbers['balance']:.2g}</td>" in verification._repr_html_()
 
 
 def test_a_zero_has_no_sign():

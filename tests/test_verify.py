@@ -466,7 +466,6 @@ MALFORMED = {
     "texts": lambda run: replace(run, t=np.array(["a"] * len(run.t))),
     "complex": lambda run: replace(run, jets=run.jets * 1j),
     "fewer times": lambda run: replace(run, t=run.t[1:]),
-    "names": lambda run: replace(run, jet_names=3),
     "stored": lambda run: replace(run, stored=[1.0]),
     "model": lambda run: replace(run, model="model"),
     "knots": lambda run: replace(run, knots=None),

@@ -1,6 +1,7 @@
 """The model: a reduction as functions on numbers, built at their first use."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from math import factorial
@@ -777,11 +778,9 @@ class Model(Detailed):
 
     def _default_start(self):
         """The time and the values of the start without held or guessed values; None if there is none."""
-        try:
+        with suppress(ServoError):
             start = self.default_start()
-        except ServoError:
-            return None
-        return start.t, start.values
+            return start.t, start.values
 
     def _lines(self, full):
         return describe(self, full)

@@ -271,9 +271,9 @@ def _stays(model, t, x):
     rates = [np.abs(f(at, x[:n_x], model.parameters).full()[:n_x, 0]) for at in instants]
     if np.isfinite(rates).all():
         return any(np.all(rate <= slow) for rate in rates)
-    residuals = model.signals("residuals")[1]
-    still = residuals.grid([t], np.append(x[:n_x], np.zeros(residuals.n_x - n_x))[:, None], model.parameters)
-    return bool(np.abs(still).max(initial=0.0) <= STILL * (1.0 + np.abs(x[:n_x]).max()))
+    residuals = model.signals("residuals")[1].expression
+    still = np.append(x[:n_x], np.zeros(residuals.numel_in(1) - n_x))
+    return bool(np.abs(residuals(t, still, model.parameters).full()).max(initial=0.0) <= slow.max())
 
 
 def _split_held(model, held, hold):
@@ -457,12 +457,13 @@ def _nearest(equations, x, aim, iterations=200):
         with np.errstate(all="ignore"):
             step = aim.reference + _step(-value - jacobian @ (aim.reference - x), jacobian, aim) - x
         trial = gauss_newton(equations, x + part * step, aim, 12)
-        ways = trial - aim.reference, x - aim.reference, trial - x
-        distance, before, change = (np.linalg.norm(aim.weights * way) for way in ways)
+        distance, before, change = (
+            np.linalg.norm(aim.weights * way) for way in (trial - aim.reference, x - aim.reference, trial - x)
+        )
         off = np.abs(equations.scaled(trial)).max(initial=0.0)
         slack = TOLERANCE if np.isfinite(off) else -REPEATED  # what has no values must be nearer
-        hidden = abs(distance - before) <= TOLERANCE * before and change >= last  # by rounding
-        if off > TOLERANCE or not distance <= before * (1 + slack) or hidden:
+        nearer = distance < before * (1 - TOLERANCE) or change < last  # where rounding hides which is nearer
+        if off > TOLERANCE or not (nearer and distance <= before * (1 + slack)):
             part /= 3
             if part < 3.0**-THIRDS:
                 break

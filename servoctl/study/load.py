@@ -41,8 +41,8 @@ def _study(facts, arrays):
     from servoctl.study.table import Study
     from servoctl.study.tradeoff import TradeOff
 
-    archive.require(isinstance(facts["kind"], str) and isinstance(facts["meta"], dict), "its kind or facts are damaged")
     columns = {name: arrays[f"column_{i}"] for i, name in enumerate(archive.named(facts["names"]))}
     damaged = [name for name, values in columns.items() if values.ndim != 1 or values.dtype.kind not in "fiubU"]
-    archive.require(not damaged, f"its columns {damaged} are damaged")
+    whole = isinstance(facts["kind"], str) and isinstance(facts["meta"], dict) and not damaged
+    archive.require(whole, f"its kind, its facts or its columns {damaged} are damaged")
     return (TradeOff if facts["kind"] == "tradeoff" else Study)(facts["kind"], columns, facts["meta"])

@@ -111,11 +111,16 @@ def _required(run):
     t, jets, knots = numbers(run.t, 1), numbers(run.jets, 2), numbers(run.knots, 1)
     least, mappings = len(model.jet_names), (run.stored, run.stored_residual)
     whole_levels = jets is not None and len(jets) >= least and (len(jets) - least) % model.n == 0
-    if t is None or knots is None or not whole_levels or jets.shape[1] != len(t):
-        raise _malformed(least, model.n, times=np.shape(run.t), jets=np.shape(run.jets))
     plain = isinstance(run.variants, tuple) and isinstance(run.success, bool | np.bool_) and isinstance(run.method, str)
-    if not plain or not all(isinstance(mapping, Mapping) for mapping in mappings):
-        raise _malformed(least, model.n, stored=[type(mapping).__name__ for mapping in mappings])
+    plain = plain and all(isinstance(mapping, Mapping) for mapping in mappings)
+    if t is None or knots is None or not plain or not whole_levels or jets.shape[1] != len(t):
+        raise SpecificationError(
+            f"The run has times of shape {np.shape(run.t)} and jets of shape {np.shape(run.jets)}.",
+            f"It has one time and {least} jets, or more by multiples of {model.n}, for each sample, and signals by name.",
+            do="Pass a run as sv.simulate returns it.",
+            times=np.shape(run.t),
+            jets=np.shape(run.jets),
+        )
     good = np.isfinite(t) & np.all(np.isfinite(jets), axis=0)
     count = len(t) if run.success or not good.any() else 1 + int(np.flatnonzero(good)[-1])
     steps = np.diff(t[:count])
@@ -124,16 +129,6 @@ def _required(run):
     parts = {"variants": _variants(model, run, count), "knots": tuple(knots)}
     parts["stored"] = {name: np.asarray(values)[:count] for name, values in run.stored.items() if np.ndim(values)}
     return replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
-
-
-def _malformed(least, n, **shapes):
-    found = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-    return SpecificationError(
-        f"The run has {found}.",
-        f"It has one time and {least} jets, or more by multiples of {n}, for each sample, and signals by name.",
-        do="Pass a run as sv.simulate returns it.",
-        **shapes,
-    )
 
 
 def _variants(model, run, count):
