@@ -116,7 +116,7 @@ def _required(run):
     if t is None or knots is None or not plain or not whole_levels or jets.shape[1] != len(t):
         raise SpecificationError(
             f"The run has times of shape {np.shape(run.t)} and jets of shape {np.shape(run.jets)}.",
-            f"It has one time and {least} jets, or more by multiples of {model.n}, for each sample, and signals by name.",
+            f"It has one time and {least} jets, or more by multiples of {model.n}, a sample, and signals by name.",
             do="Pass a run as sv.simulate returns it.",
             times=np.shape(run.t),
             jets=np.shape(run.jets),
