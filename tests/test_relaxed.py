@@ -16,7 +16,7 @@ from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded
 from servoctl.gallery import overhead_crane
 from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST, Relaxation
 from servoctl.inversion.transcription import IPOPT, LONGEST, WATCHED, Mesh, Transcription, bernstein
-from servoctl.run import load
+from servoctl.study.load import load
 
 rest_to_rest = sv.paths.rest_to_rest
 

@@ -138,7 +138,7 @@ def test_a_report_on_a_jerk_program_finds_no_rest_and_says_so():
     """At a = g the reaction has no direction, and the linearised constraints are singular."""
     model, scene = sv.derive(*constant_jerk()), gallery["constant-jerk"]
     start = model.start(**scene.start, guess=scene.guess)
-    report = sv.report(model, sv.simulate(model, start, (0.0, 1.0)))
+    report = sv.report(sv.simulate(model, start, (0.0, 1.0)))
     assert report.verdict == "marginal" and "no rest" in repr(report)
 
 

@@ -696,7 +696,7 @@ def test_a_guess_that_no_state_is_near_is_printed_with_its_distance():
     assert "guess" not in str(model.start(guess={"x": 0.6, "y": 0.8}))
     start = model.start(guess={"x": 10.0, "y": 5.0})
     assert start["x"] / start["y"] == pytest.approx(2.0)
-    assert "9.106 off: x = 0.8944, guessed 10" in str(start)
+    assert "9.106 off the guess: x = 0.8944, guessed 10" in str(start)
 
 
 def test_an_angle_that_looks_like_degrees_is_printed_in_radians():
