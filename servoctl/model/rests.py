@@ -95,7 +95,7 @@ class Rests:
         columns, weights = (unforced @ of_q)[:, movable], weights[movable]
         columns = np.where(np.abs(columns) > ENTRY, columns, 0.0)
         largest = np.maximum(np.abs(columns).max(axis=0, initial=0.0), TINY)
-        rank = np.linalg.matrix_rank(columns / largest, rtol=RANK) if columns.size else 0
+        rank = np.linalg.lstsq(columns / largest, unforced @ right, rcond=RANK)[2] if columns.size else 0
         U, singular, V = np.linalg.svd(columns / weights, full_matrices=False)
         step[: self.nq][movable] = V[:rank].T @ ((U[:, :rank].T @ unforced @ right) / singular[:rank]) / weights
         step /= max(1.0, np.abs(step[: self.nq][angles]).max(initial=0.0))  # a radian at most
