@@ -214,8 +214,8 @@ class _Checks:
     def _inputs(self):
         """The actuation, or the reaction of an ideal program, as the run gives it, by variant."""
         names = self.model.signals("reaction" if self.model.ideal else "actuation")[0]
-        stored = {name: numbers(self.stored.get(name, np.nan), 1) for name in names}
-        alike = {name: v for name, v in stored.items() if v is not None and v.shape == self.run.t.shape}
+        stored = ((name, numbers(self.stored.get(name, np.nan), 1)) for name in names)
+        alike = {name: v for name, v in stored if v is not None and v.shape == self.run.t.shape}
         values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), len(self.run.t))
         return [values[:, a:b] for a, b, _ in self.run.variants]
 
@@ -225,8 +225,7 @@ class _Checks:
         """The largest inertia of each velocity along the run, (n,) array."""
         first, f = self.samples[0], self.samples[0].model.function("matrices")
         few = np.unique(np.linspace(0, len(first.t) - 1, 16).astype(int))
-        values = f.grid(first.t[few], first.z[: f.n_x, few], first.model.parameters)
-        return np.abs(values[-self.model.n :]).max(axis=1)
+        return np.abs(f.grid(first.t[few], first.z[: f.n_x, few], first.model.parameters)[-self.model.n :]).max(axis=1)
 
     def _sizes(self, instants):
         """The size of each jet (n_z,): its largest value, at least FLOOR of what others of its level have.
@@ -379,12 +378,21 @@ class _Checks:
 
     def balance(self):
         """Largest part of the mechanism's balance that the run's inputs leave, relative to the terms of each row."""
-        n, n_z, limit, parts = self.model.n, len(self.model.jet_names), self.limit("balance"), []
+        n, n_z, rounding, parts = self.model.n, len(self.model.jet_names), ROUNDING / self.limit("balance"), []
         for at in self.instants:
             x = np.vstack([at.z[:n_z], at.inputs, at.signals("all_multipliers")])
-            parts.append(at.model.function("balanced").grid(at.t, x, at.model.parameters).reshape(3, n, -1))
+            y = at.model.function("balanced").grid(at.t, x, at.model.parameters)
+            few = np.unique(np.linspace(0, len(at.t) - 1, FEW_SIZES).round().astype(int))
+            felt = self._response(
+                lambda t, x, at=at: at.model.function("balanced").grid(t, x, at.model.parameters)[:n],
+                at.t[few],
+                x[:, few],
+                y[:n, few],
+                1.0 + np.abs(x[:, few]),
+            )
+            parts.append([y[:n], y[n : 2 * n], y[2 * n :] + felt.max(axis=1, keepdims=True)])
         left, terms, sums = np.concatenate(parts, axis=2)
-        return largest(_ratio(left, terms.max(axis=1, keepdims=True) + ROUNDING / limit * sums))
+        return largest(_ratio(left, terms.max(axis=1, keepdims=True) + rounding * sums))
 
     def residuals(self):
         """Largest residual of each row at any level, by the relative change of the jets that would remove it."""
@@ -400,9 +408,8 @@ class _Checks:
             levels = values(at.t, z)
             known = levels if at.first is None else self._as_stored(np.abs(levels), names, at.first)
             few = np.unique(np.linspace(0, len(at.t) - 1, FEW_SIZES).round().astype(int))
-            response = self._response(values, at.t[few], z[:, few], levels[:, few], self.sizes[: f.n_x, None])
-            sizes = np.median(response, axis=1, keepdims=True)
-            for (name, _), level, size in zip(names, known, sizes, strict=True):
+            sizes = self._response(values, at.t[few], z[:, few], levels[:, few], self.sizes[: f.n_x, None])
+            for (name, _), level, size in zip(names, known, np.median(sizes, axis=1, keepdims=True), strict=True):
                 worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
         for name in self.model.reduction.mechanism.reported:  # of a program that inputs realise approximately
             del worst[f"residual {name}"]
@@ -428,8 +435,8 @@ class _Checks:
             except ServoError:
                 self.doubts.append(f"the stored signal {name!r} is none of the model's")
                 continue
-            alike = values is not None and values.shape == again.shape
-            worst = max(worst, largest(_ratio(values - again, np.abs(again).max())) if alike else np.inf)
+            off = np.inf if values is None or values.shape != again.shape else values - again
+            worst = max(worst, largest(_ratio(off, np.abs(again).max())))
         return {"signals": worst}
 
     # energy
@@ -447,9 +454,10 @@ class _Checks:
         scale += ROUNDING / LIMITS["energy"] * self.powers[4].max()
         work = self._work(np.diff(energy), AGREES * LIMITS["energy"] * scale)
         if not np.isfinite(work).all():
-            first = self.run.t[int(np.argmin(np.isfinite(work)))]
-            what = f"peaks of power after t = {first:.6g} s are too narrow to integrate"
-            self.doubts.append(f"{what}: simulate with more samples (t_eval)")
+            where = f"after t = {self.run.t[int(np.argmin(np.isfinite(work)))]:.6g} s"
+            self.doubts.append(
+                f"peaks of power {where} are too narrow to integrate: simulate with more samples (t_eval)"
+            )
             return {}
         return {"energy": largest((energy - energy[0] - np.append(0.0, np.cumsum(work))) / scale)}
 
