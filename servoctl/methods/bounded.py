@@ -328,7 +328,7 @@ class FreeEntries:
         """
         t, guess, size = np.array([float(t)]), np.asarray(x, dtype=float)[:, None], self.size[self.free]
         fastest = self._scaled(self.local(t, guess)[1]).max(initial=1.0)
-        for Q in (np.eye(len(size)), *([self._others(guess)] if moving else [])):
+        for Q in (entries(guess) for entries in (lambda x: np.eye(len(size)), self._others)[: 1 + moving]):
             x = self._quasi_static(t, guess, Q)
             rate, A, _, tangent = self.local(t, x)
             still = np.isfinite(x).all() and np.abs((rate / size) @ Q).max(initial=0.0) <= STANDS * fastest

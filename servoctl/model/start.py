@@ -588,7 +588,7 @@ def _not_found(equations, x, residuals):
     end = (
         f"where the invariant {name!r} has no {lacks}"
         if lacks
-        else (f"with the residual {residuals[worst]:.2e} of the invariant {name!r}")
+        else f"with the residual {residuals[worst]:.2e} of the invariant {name!r}"
     )
     return InconsistentStart(
         f"The search for a consistent start ended {end}.",

@@ -3,9 +3,10 @@
 from servoctl import archive
 from servoctl.errors import SpecificationError
 from servoctl.run import Run, as_saved, of_model
+from servoctl.study.table import Study
 
 
-def load(path, model=None):
+def load(path, model=None) -> Run | Study:
     """What `save` of a run, a closed loop or a study wrote.
 
     Parameters
@@ -38,7 +39,6 @@ def load(path, model=None):
 
 def _study(facts, arrays):
     """The study of an archive, of the class that wrote it."""
-    from servoctl.study.table import Study
     from servoctl.study.tradeoff import TradeOff
 
     columns = {name: arrays[f"column_{i}"] for i, name in enumerate(archive.named(facts["names"]))}

@@ -174,6 +174,11 @@ class _Instants:
     inputs: np.ndarray
     first: int | None = None
 
+    @property
+    def few(self):
+        """Indices of the instants at which sizes are measured."""
+        return np.unique(np.linspace(0, len(self.t) - 1, FEW_SIZES).round().astype(int))
+
     def signals(self, kind):
         f = self.model.signals(kind)[1]
         return f.grid(self.t, self.z[: f.n_x], self.model.parameters)
@@ -382,13 +387,12 @@ class _Checks:
         for at in self.instants:
             x = np.vstack([at.z[:n_z], at.inputs, at.signals("all_multipliers")])
             y = at.model.function("balanced").grid(at.t, x, at.model.parameters)
-            few = np.unique(np.linspace(0, len(at.t) - 1, FEW_SIZES).round().astype(int))
             felt = self._response(
                 lambda t, x, at=at: at.model.function("balanced").grid(t, x, at.model.parameters)[:n],
-                at.t[few],
-                x[:, few],
-                y[:n, few],
-                1.0 + np.abs(x[:, few]),
+                at.t[at.few],
+                x[:, at.few],
+                y[:n, at.few],
+                1.0 + np.abs(x[:, at.few]),
             )
             parts.append([y[:n], y[n : 2 * n], y[2 * n :] + felt.max(axis=1, keepdims=True)])
         left, terms, sums = np.concatenate(parts, axis=2)
@@ -400,15 +404,15 @@ class _Checks:
         worst = {f"residual {name}": 0.0 for name in self.run.residual}
         for at in self.instants:
             f = at.model.signals("residuals")[1]
-            z = at.z[: f.n_x]
 
             def values(t, z, f=f, model=at.model):
                 return f.grid(t, z, model.parameters)
 
-            levels = values(at.t, z)
+            levels = values(at.t, at.z[: f.n_x])
             known = levels if at.first is None else self._as_stored(np.abs(levels), names, at.first)
-            few = np.unique(np.linspace(0, len(at.t) - 1, FEW_SIZES).round().astype(int))
-            sizes = self._response(values, at.t[few], z[:, few], levels[:, few], self.sizes[: f.n_x, None])
+            sizes = self._response(
+                values, at.t[at.few], at.z[: f.n_x, at.few], levels[:, at.few], self.sizes[: f.n_x, None]
+            )
             for (name, _), level, size in zip(names, known, np.median(sizes, axis=1, keepdims=True), strict=True):
                 worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
         for name in self.model.reduction.mechanism.reported:  # of a program that inputs realise approximately
