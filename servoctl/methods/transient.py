@@ -13,8 +13,15 @@ from servoctl.run import AGREES
 def first_transient(run, motion):
     """What to say where a force begins above all its later peaks, with a start, found, that has none of it; else "".
 
-    `motion(start, span)` is the run of the same model from a state over a span (t0, t1) [s].
+    `motion(start, span)` is the run of the same model from a state over a span (t0, t1) [s]. A run keeps the answer.
     """
+    if "_transient" not in vars(run):
+        vars(run)["_transient"] = _sought(run, motion)
+    return vars(run)["_transient"]
+
+
+def _sought(run, motion):
+    """As `first_transient`."""
     model, start, moves = run.model, run.start, np.abs(run.jets[run.model.nq :, 0]).max() > STILL  # at rest is none
     driven = model.reduction.mechanism.actuators and not model.ideal
     if not (moves and driven and model.free and start and run.success and run.t[0] < run.t[-1]):

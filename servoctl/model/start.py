@@ -260,20 +260,26 @@ def _rests(model, equations, aim, held, conditions):
 
 
 def _stays(model, t, x):
-    """Whether a state stays from t on or, as where a path begins with a jump, did before.
+    """Whether a state and the residuals stay from t on or, as where a path begins with a jump, did before.
 
     Where it is singular, and has no rates, the program holds there if nothing moves.
     """
     if model.flat:
         return True
-    f, n_x = model.function("ode").expression, len(model.state_names)
-    slow, instants = STILL * (1.0 + np.abs(x[:n_x])), (t, np.nextafter(t, -np.inf))
-    rates = [np.abs(f(at, x[:n_x], model.parameters).full()[:n_x, 0]) for at in instants]
-    if np.isfinite(rates).all():
-        return any(np.all(rate <= slow) for rate in rates)
-    residuals = model.signals("residuals")[1].expression
-    still = np.append(x[:n_x], np.zeros(residuals.numel_in(1) - n_x))
-    return bool(np.abs(residuals(t, still, model.parameters).full()).max(initial=0.0) <= slow.max())
+    rates, n_x, p = model.function("ode").expression, len(model.state_names), model.parameters
+    slow = STILL * (1.0 + np.abs(x[:n_x]))
+
+    def largest(at, rate):
+        residuals = model.signals("residuals", rate)[1].expression
+        still = np.append(x[:n_x], np.zeros(residuals.numel_in(1) - n_x))
+        return np.abs(residuals(at, still, p).full()).max(initial=0.0)
+
+    def stays(at):
+        moving = np.abs(rates(at, x[:n_x], p).full()[:n_x, 0])
+        there = np.all(moving <= slow) if np.isfinite(moving).all() else largest(at, 0) <= slow.max()
+        return bool(there and largest(at, 1) <= slow.max())
+
+    return any(map(stays, (t, np.nextafter(t, -np.inf))))
 
 
 def _split_held(model, held, hold):

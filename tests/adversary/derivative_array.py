@@ -157,7 +157,7 @@ class Reference:
         elif redundant:  # u = W⁻¹Pᵀμ = Eᵀy, y = N Gᵀμ, with W = 1; any y if u has k effects only, which the rows give
             force, mu, y, z = (ca.SX.sym(name, size) for name, size in (("u", m), ("mu", k), ("y", n), ("z", km)))
             extra, reaction, unknown = [force - self.E.T @ y, self.Gm @ y], self.E @ force, [force, nu, y]
-            if self.ranks(0.0, np.array(case.guess), np.array(case.speeds)[:, None])["reach"] > k:
+            if self._reach() > k:
                 extra.append(self.mass @ y + self.Gm.T @ z - self.G.T @ mu)
                 unknown += [mu, z]
         else:
@@ -181,6 +181,12 @@ class Reference:
         self.n_rows, self.n_extra = rows.numel(), sum(e.numel() for e in extra)
         _, made = self.leading(self.material)
         self.row_levels = [0] * n + [1] * n + [-10] * self.n_extra + [order - 1 for order in (*orders, *made)]
+
+    def _reach(self):
+        """How many effects the actuators have, but at single states: the most of a few about the guess."""
+        moves = np.random.default_rng(0).normal(0, 0.3, (3, self.n)) * self.case.sizes[0]
+        speeds = np.array(self.case.speeds)[:, None]
+        return max(self.ranks(0.1, self.case.guess + move, speeds)["reach"] for move in moves)
 
     def array(self, t, q, w, multipliers):
         """Residuals and Jacobian with respect to all coefficients of q (n, N+2), w (n, N+1), multipliers (p, N)."""

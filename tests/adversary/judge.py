@@ -21,6 +21,7 @@ POLE, FURTHER = 0.9, 1.2  # or with this power, as a pole does, where the start 
 BESIDE = (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)  # distances [s, too] from a state at which the reference has no verdict
 NEARLY = 0.99  # of the way to a stop before the first sample, which is followed again
 POWER = 0.3  # or it grows at least with this power of one over the time that is left
+ROUNDINGS = 16  # of the terms of a row, which rows that are nearly dependent amplify
 LARGE = 1e4  # a motion that has grown so far may end
 MOST_CALLS = 100_000_000  # of functions, for a case; half a million are usual
 
@@ -29,12 +30,12 @@ MOST_CALLS = 100_000_000  # of functions, for a case; half a million are usual
 class Verdict:
     """`outcome` is "right", "refused rightly", or "wrong: ..." with what is wrong; `detail` holds the numbers.
 
-    Of a plan `gain` is the largest sensitivity of accelerations and actuation.
+    Of a plan `tolerance` is what sensitivities of accelerations and actuation, and rounding of the rows, allow.
     """
 
     outcome: str
     detail: str = ""
-    gain: float = 0.0
+    tolerance: float = AGREE
 
     @property
     def wrong(self):
@@ -135,7 +136,7 @@ def _judged(case, a):
 
 def _alike(case, here, drawn, verdict):
     """The verdict on a case, wrong where it ends otherwise than in the coordinates in which it was drawn."""
-    there, tolerance = _attempt(drawn, verified=False), AGREE * max(1.0, verdict.gain / SHARP)
+    there = _attempt(drawn, verified=False)
     ends = [type(a.error).__name__ if a.error else "a plan" for a in (there, here)]
     if ends[0] != ends[1]:
         errors = " | ".join(f"{a.stage}: {a.error}" for a in (there, here))
@@ -148,7 +149,7 @@ def _alike(case, here, drawn, verdict):
     apart["motion"] = _apart(case.as_drawn(here.run.jets[:, INSTANTS]), there.run.jets[:, INSTANTS])
     apart["actuation"] = _apart(*(_force(c, a.run)[:, INSTANTS] for c, a in ((case, here), (drawn, there))))
     numbers = ", ".join(f"{what} {gap:.1e}" for what, gap in apart.items()) + "; " + verdict.detail
-    other = next((what for what, gap in apart.items() if not gap <= tolerance), None)
+    other = next((what for what, gap in apart.items() if not gap <= verdict.tolerance), None)
     return Verdict(f"wrong: moved, another {other}", numbers) if other else Verdict(verdict.outcome, numbers)
 
 
@@ -198,12 +199,19 @@ def _compared(reference, case, model, run, proof):
     numbers += f"; gain {max(gains, default=np.inf):.1e}; {unclear} {proof!r}"
     if unclear:
         return Verdict("wrong: a plan that the reference does not determine", numbers)
-    if max(worst.values()) > AGREE * max(1.0, max(gains) / SHARP):
+    tolerance = max(AGREE, AGREE * max(gains) / SHARP, _rounding(reference, case, run))
+    if max(worst.values()) > tolerance:
         what = "failed by verify" if not proof.passed else "verified"
         return Verdict(f"wrong: another motion or force, {what}", numbers)
     if not proof.passed:
         return Verdict("wrong: verify fails a right plan (" + ", ".join(map(_kind, proof.failures)) + ")", numbers)
-    return Verdict("right", numbers, max(gains))
+    return Verdict("right", numbers, tolerance)
+
+
+def _rounding(reference, case, run):
+    """What rounding of the given rows, whose coordinates have other origins, leaves undetermined."""
+    apart = min(reference.ranks(run.t[k], *_coefficients(run.jets[: -case.n, k], case.n))["rows"] for k in INSTANTS)
+    return ROUNDINGS * np.finfo(float).eps * max([1.0, *(abs(origin) for origin, *_ in case.moves)]) / apart
 
 
 def _kind(failure):
