@@ -242,23 +242,10 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
 def growth_bound(model, run):
     """A bound of the growth of errors along a run, by the logarithmic norm of its linearisation.
 
-    Parameters
-    ----------
-    model : Model
-    run : Run
-        A motion of it, with internal dynamics.
-
-    Returns
-    -------
-    float
-        exp max ∫ μ dt over all parts of the run, μ = λ_max(A + Aᵀ)/2 with A = Nᵀ J N in scaled states (Söderlind 2006,
-        eq. (2.5)), times the difference of the integral by every other instant; inf where A is not finite.
-
-    Notes
-    -----
-    The scale of the states is one for the whole run, the one that balances the mean of (J N Nᵀ)². There are few
-    instants, at equal parts of the run's time and of the way of its state, so that it takes a part of the time of a
-    motion. A large bound says nothing: where A turns, an error may stay small though μ is large.
+    It is exp max ∫ μ dt over all parts of the run, μ = λ_max(A + Aᵀ)/2 with A = Nᵀ J N in scaled states
+    (Söderlind 2006, eq. (2.5)), where the integral is enlarged by its difference from that by every other instant; inf
+    where A is not finite or samples are few. One scale of the states, which balances the mean of (J N Nᵀ)², serves the
+    whole run. A large bound says nothing: where A turns, an error may stay small though μ is large.
     """
     x = _states(model, run)
     if len(run.t) <= BOUNDED_AT // 2 or not np.isfinite(x).all():
@@ -281,20 +268,9 @@ def growth_bound(model, run):
 def quiet_by_series(model, run, last):
     """Whether propagators by the series of a motion say that its internal dynamics are not unstable.
 
-    They are those of `internal_dynamics`, without a Jacobian and without smaller and smaller steps.
-
-    Parameters
-    ----------
-    model : Model
-    run : Run
-        A motion of it by the Taylor method, with internal dynamics.
-    last : int
-        Highest index of its coefficients.
-
-    Returns
-    -------
-    bool
-        False where the series do not follow the motion, which then is judged by its linearisation.
+    They are those of `internal_dynamics`, without a Jacobian and without smaller and smaller steps; `last` is the
+    highest index of the coefficients of the motion, which is one by the Taylor method. False leaves the motion to be
+    judged by its linearisation, as where the series do not follow it.
     """
     x, size = _states(model, run), _sizes(model, run)
     if len(run.variants) > 1 or switching(model) is not None or not np.isfinite(x[:, [0, -1]]).all():
@@ -383,22 +359,10 @@ class Tangents:
 
 
 def linearised(model, run, count):
-    """Linearise the internal dynamics along a run.
+    """Internal dynamics linearised along a run: instants t (K,) [s] and A = Nᵀ J N (K, f, f) [1/s].
 
-    Parameters
-    ----------
-    model : Model
-    run : Run
-        A motion of it.
-    count : int
-        Number of instants, spread over the samples; those without a finite Jacobian are left out.
-
-    Returns
-    -------
-    t : (N,) array
-        [s]
-    A : (N, f, f) array
-        Nᵀ J N [1/s], f the number of states less that of invariants.
+    At most `count` instants are spread over the samples, and those without a finite Jacobian are left out; f is the
+    number of states less that of invariants.
     """
     picked = np.unique(np.linspace(0, len(run.t) - 1, count).round().astype(int))
     tangents = _tangents(model, run, picked, run.t[picked], _states(model, run)[:, picked])

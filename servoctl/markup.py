@@ -55,11 +55,7 @@ def listed(texts, room, apart=", ", unit=""):
 def rows_of(head, rows):
     """A table with a heading; columns of numbers are aligned to the right. All texts are escaped.
 
-    Parameters
-    ----------
-    head : sequence of str
-    rows : iterable of sequences
-        As many entries each as the heading has.
+    Each row has as many entries as the heading; without rows there is a paragraph "none" instead.
     """
     rows = [tuple(map(str, row)) for row in rows]
     if not rows:

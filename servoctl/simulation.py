@@ -295,22 +295,10 @@ def _has_internal_dynamics(model):
 def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
     """A run that gives the verdict on its internal dynamics when it is read; warns at once if they are unstable.
 
-    Most motions need no propagators to know that there is nothing to warn of. Who interrupts a motion does not wait.
-
-    Parameters
-    ----------
-    run : Run
-        With internal dynamics.
-    tolerance : float
-        Relative error of a step of its method.
-    again : callable, optional
-        Returns the same motion with more samples, where the run has few of them.
-    by_series : int, optional
-        Highest index of the coefficients of a motion by the Taylor method.
-
-    Returns
-    -------
-    Run
+    Most motions need no propagators to know that there is nothing to warn of. Whoever interrupts a motion does not
+    wait. `tolerance` is the relative error of a step of the run's method, `again` returns the same motion with more
+    samples where the run has few of them, and `by_series` is the highest index of the coefficients of a motion by the
+    Taylor method.
     """
     known = run.with_verdict(partial(_verdict, tolerance=tolerance))
     try:

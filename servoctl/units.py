@@ -21,12 +21,7 @@ def as_units(units):
 def units_by_name(units, names, what):
     """Units of some of the names, from a dict, or of all of them, from a text or a list in their order.
 
-    Parameters
-    ----------
-    units : str, sequence of str or dict of str to str, or None
-    names : sequence of str
-    what : str
-        What is named, for `NameUnknown`: "coordinate".
+    `what` says what is named, such as "coordinate", for the message of `NameUnknown`.
     """
     listed = units.split() if isinstance(units, str) else as_list(units)
     if listed is None:

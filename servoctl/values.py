@@ -133,13 +133,7 @@ class Identity:
 class Deferred(dict):
     """A dict of which some values are computed together when one of its values is first read.
 
-    Parameters
-    ----------
-    known : dict
-    names : sequence of str
-        Keys of the others.
-    compute : callable
-        Returns the others by name.
+    `compute` returns the values of `names`, those that `known` does not hold. The dict pickles as a plain one.
     """
 
     def __init__(self, known, names, compute):

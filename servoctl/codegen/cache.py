@@ -25,13 +25,10 @@ _writes = itertools.count()
 
 
 def cache_directory():
-    """Directory of compiled libraries and derivations.
+    """Directory of compiled libraries and derivations; it need not exist.
 
-    Returns
-    -------
-    pathlib.Path
-        ``SERVOCTL_CACHE`` if set, else ``servoctl`` under the user's cache directory, else a folder of this user under
-        the temporary directory; it need not exist.
+    It is ``SERVOCTL_CACHE`` if set, else ``servoctl`` under the user's cache directory, else a folder of this user
+    under the temporary directory.
     """
     try:
         return _chosen_directory()
@@ -56,10 +53,8 @@ def _chosen_directory():
 def read_cached(path):
     """Content (bytes) of a file that `replacing` wrote.
 
-    Raises
-    ------
-    OSError
-        If the file is missing, is damaged, or was written for another name; if another user wrote it or can replace it.
+    Raises OSError if the file is missing, is damaged or was written for another name, or if another user wrote it or
+    can replace it.
     """
     _require_private(path.parent)
     with open(path, "rb", opener=_at_once) as file:
@@ -105,10 +100,7 @@ def _make_private(directory):
 def replacing(path):
     """The name of a temporary file, which replaces the one at `path` in one step, with its digest appended.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be written.
+    Raises OSError if the file cannot be written.
     """
     import tempfile
 

@@ -39,15 +39,8 @@ _CIRCULAR = {ca.OP_SIN, ca.OP_COS}
 def short_chains(statements):
     """Statements of a function x' = f(t, x, p) whose results follow soon after the entries of x that are known last.
 
-    Parameters
-    ----------
-    statements : list of (target, operation, operands)
-        In single assignment: operands are values, which are numbered, constants, or C text of inputs.
-
-    Returns
-    -------
-    list of (target, operation, operands)
-        The same outputs, to rounding.
+    Statements (target, operation, operands) are in single assignment; operands are numbered values, constants, or C
+    text of inputs. The outputs are the same, to rounding.
     """
     chains = _Chains(statements)
     for statement in statements:

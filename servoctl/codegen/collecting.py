@@ -47,15 +47,8 @@ _POWERS = {
 def ways(statements):
     """Ways to compute a function: the statements that are given, and such with like terms collected.
 
-    Parameters
-    ----------
-    statements : list of (target, operation, operands)
-        In single assignment: operands are values, which are numbered, constants, or C text of inputs.
-
-    Returns
-    -------
-    list of lists of (target, operation, operands)
-        All have the same outputs, to rounding.
+    Statements (target, operation, operands) are in single assignment; operands are numbered values, constants, or C
+    text of inputs. All ways have the same outputs, to rounding.
     """
     return [statements, *(collected(statements, added) for added in ADDED)]
 

@@ -63,22 +63,10 @@ def worth_compiling(calls):
 def library(text, level="-O1", exact=False, calls=math.inf):
     """Load the library of a C translation unit; compile it where it is neither loaded nor on disk.
 
-    Parameters
-    ----------
-    text : str
-        C text.
-    level : str
-        Optimisation level, perhaps with further flags behind it, which a compiler may refuse, as clang does those of
-        gcc. "-O1" compiles fastest, and its straight-line code is at most a quarter slower than "-O3".
-    exact : bool
-        Whether the results are those of the operations one by one, without contraction.
-    calls : float
-        Calls of its functions that are known, of which `once` may ask for more.
-
-    Returns
-    -------
-    ctypes.CDLL or None
-        None without a compiler, if compiling failed (one warning per process, unless none was chosen), or not yet.
+    None without a compiler or if compiling failed (one warning per process, unless none was chosen), or while it is not
+    on disk and fewer `calls` of its functions are known than `once` asks for. `level` may have further flags behind it,
+    which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is at
+    most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
     """
     from servoctl.codegen.tables import bind  # imports NumPy and CasADi, which are not needed to name the compiler
 

@@ -70,45 +70,19 @@ _FORMS_OF_ONE = {
 
 @frozen
 class Dialect:
-    """How C writes the numbers and the head of a function.
+    """How C writes the numbers and the head of a function."""
 
-    Attributes
-    ----------
-    number : str
-        Type of the numbers.
-    literal : str
-        Format of a constant: {} is replaced by a C number.
-    prefix : str
-        Prefix of elementary functions.
-    forms : dict of str to str
-        Formats of the operations that are no call of an elementary function, by name.
-    common : bool
-        Whether all lanes share p, an array of ``double``.
-    linkage : str
-        Linkage of the function and of its chunks; without one, the chunks are static and not inlined.
-    exact : bool
-        Whether the operations are those of CasADi, one by one, without shared reciprocals.
-    whole : bool
-        Whether the text holds the numbers of large tables; otherwise they are set when its library is loaded.
-    chained : bool
-        Whether each evaluation waits for the one before: the statements of one chunk are those of `short_chains`.
-    collected : bool
-        Whether like terms of these are collected before.
-    scaled : bool
-        Whether the statements are those of `scaled`.
-    """
-
-    number: str = "double"
-    literal: str = "{}"
-    prefix: str = ""
-    forms: dict = field(default_factory=dict)
-    common: bool = False
-    linkage: str = ""
-    exact: bool = False
-    whole: bool = False
-    chained: bool = False
-    collected: bool = False
-    scaled: bool = False
+    number: str = "double"  # type of the numbers
+    literal: str = "{}"  # format of a constant: {} is replaced by a C number
+    prefix: str = ""  # of elementary functions
+    forms: dict = field(default_factory=dict)  # formats, by name, of operations that call no elementary function
+    common: bool = False  # whether all lanes share p, an array of double
+    linkage: str = ""  # of the function and its chunks; without one, chunks are static and not inlined
+    exact: bool = False  # whether operations are those of CasADi, one by one, without shared reciprocals
+    whole: bool = False  # whether the text holds the numbers of large tables; else loading its library sets them
+    chained: bool = False  # whether each evaluation waits for the last: one chunk has the statements of `short_chains`
+    collected: bool = False  # whether like terms of these are collected before
+    scaled: bool = False  # whether the statements are those of `scaled`
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -204,33 +178,11 @@ def emit(f, name, loops=(), *, project=None, others=None, sizes=None, wide=True,
     """C translation unit of a function and of loops over it; it includes files of `loops.SOURCES`.
 
     The unit defines ``void name(double t, const double *x, const double *p, double *y)`` (``y`` overlaps no input),
-    ``name_point``, ``name_grid``, ``name_casadi`` in the form that CasADi calls, and the functions of each loop's file.
-    For loops in `PHASED` also ``name_instant``, ``name_correction`` and ``name_rest``; see `phases`. For the loop
-    "taylor" ``name_still`` and ``name_moving``; see `series`.
-
-    Parameters
-    ----------
-    f : casadi.Function
-        SX function (t, x, p) -> y of elementary operations (`EMITTED`).
-    name : str
-        A C identifier, the prefix of every external symbol.
-    loops : sequence of {"rk", "newton", "taylor", "radau", "closed", "law"}
-        Files to include.
-    project : casadi.Function, optional
-        SX function (t, x, p) -> change of x that restores invariants; loops may call it after their steps.
-    others : dict of str to casadi.Function, optional
-        Further SX functions of this form, with sizes of their own, which become ``name_KEY``.
-    sizes : dict of str to int, optional
-        Constants of the loops; their names are in capitals in C.
-    wide : bool
-        Whether grids and Newton's method may evaluate eight points at once, by a second copy of f.
-    chunk : int
-        Largest number of statements in one C function.
-
-    Returns
-    -------
-    str
-        The same text for the same function, name and loops, in every process.
+    ``name_point``, ``name_grid``, ``name_casadi`` in the form that CasADi calls, ``name_KEY`` for `others`, and the
+    functions of each loop's file; for loops in `PHASED` also ``name_instant``, ``name_correction`` and ``name_rest``
+    (see `phases`), for "taylor" ``name_still`` and ``name_moving`` (see `series`). `sizes`, with names in capitals, are
+    constants of the loops; `wide` lets grids and Newton's method evaluate eight points at once, by a second copy of f;
+    a C function has at most `chunk` statements. The same arguments give the same text in every process.
     """
     dialect = SCALAR_INLINE if INLINE_SINES.intersection(loops) else SCALAR
     dialect = SCALAR_CHAINED if "closed" in loops else dialect

@@ -13,17 +13,8 @@ _OF_ONE = {ca.OP_ASSIGN: 1.0, ca.OP_NEG: -1.0, ca.OP_TWICE: 2.0}
 def folded(f):
     """The output of an SX function with its factors ±2^k gathered.
 
-    Results are the same to the last bit, because products with powers of two do not round.
-
-    Parameters
-    ----------
-    f : casadi.Function
-        SX function with one column output.
-
-    Returns
-    -------
-    SX
-        The output in terms of the symbols `f.sx_in()`.
+    Results are the same to the last bit, because products with powers of two do not round. The function has one column
+    output, which is given in terms of the symbols `f.sx_in()`.
     """
     inputs = [column.elements() for column in f.sx_in()]
     work, outputs = {}, [ca.SX(0)] * f.numel_out(0)

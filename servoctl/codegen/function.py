@@ -32,37 +32,15 @@ _OUTPUTS_PER_STATE = {"rk": 1, "newton": 3, "taylor": 1}
 
 
 def compiled(f, name, loops=(), project=None, others=None, sizes=None):
-    """Make a compiled function of an SX function.
+    """Make a compiled function of an SX function f(t, x, p) with one dense column output y (n_y).
 
-    Parameters
-    ----------
-    f : casadi.Function
-        SX function of t (scalar), x (n_x), p (n_p), all dense, with one dense column output y (n_y).
-    name : str
-        A C identifier.
-    loops : sequence of {"rk", "newton", "taylor", "radau", "closed", "law"}
-        Loops over f: the first three are methods of the result, the others are called by `Compiled.native`.
-    project : casadi.Function, optional
-        SX function (t, x, p) -> change of x that restores invariants; loops may call it after their steps.
-    others : dict of str to casadi.Function, optional
-        Further functions of the same form in the same library, called by `Compiled.native`.
-    sizes : dict of str to int or tuple of int, optional
-        Constants of the loops. That of "newton": the number of "pivots" (default: 0). Those of "taylor": the numbers
-        of coordinates "nq" and of quasi-velocities "n", the order s̄ "top", the highest index of coefficients "last",
-        "plain" (1 if q' = γ', else 0), for `whole` with functions "rates" and "invariants" of `others` the number of
-        outputs "rates" and of values "invariants", and, beside a function "settled" there, (t, x, p) -> (x, γ^(s̄)),
-        "free": a tuple of 0 for each entry of γ', ..., γ^(s̄-1) that this function gives, of 1 for those integrated.
-
-    Returns
-    -------
-    Compiled
-
-    Raises
-    ------
-    SpecificationError
-        If f is no such function, contains an operation that is not elementary, or has too few outputs for a loop.
-    NameUnknown
-        If a loop is none of these.
+    Of the `loops`, "rk", "newton" and "taylor" are methods of the result, the others are called by `Compiled.native`,
+    as are `others`, functions of the same form in its library. `project`, (t, x, p) -> change of x, restores
+    invariants; loops may call it after their steps. `sizes` are constants of the loops: for "newton" the number of
+    "pivots" (default: 0); for "taylor" the numbers "nq" of coordinates and "n" of quasi-velocities, the order s̄ "top",
+    the highest index of coefficients "last", "plain" (1 if q' = γ', else 0), for `whole` "rates" and
+    "invariants", the numbers of values of these functions in `others`, and, beside "settled" there, (t, x, p) ->
+    (x, γ^(s̄)), "free": 0 for each entry of γ', ..., γ^(s̄-1) that it gives, 1 for those integrated.
     """
     _require_columns(f, name)
     for part in filter(None, (f, project, *(others or {}).values())):
@@ -129,21 +107,8 @@ class Compiled:
     """A function y = f(t, x, p) whose loops and long grids are compiled; made by `compiled`.
 
     Several threads may call it and its loops at once. It pickles: the copy loads its library from the cache, or builds
-    it again.
-
-    Attributes
-    ----------
-    name : str
-    n_x, n_p, n_y : int
-        Numbers of states, parameters and outputs.
-    loops : tuple of str
-        Loops that it can run.
-    others : dict of str to casadi.Function
-        Further functions in the same library.
-    sizes : dict of str to int
-        Constants of the loops.
-    expression : casadi.Function
-        The SX function (t, x, p) -> y.
+    it again. States, parameters and outputs are `n_x`, `n_p` and `n_y` in number; `expression` is the SX function,
+    `others` are further ones in the same library, and `sizes` are constants of the loops.
     """
 
     __slots__ = "__dict__", "__weakref__", "_builtin"

@@ -47,12 +47,7 @@ class Workspace(threading.local):
 class StepsOfThread:
     """The Steps of taylor.c with their memory: five numbers, and addresses of start, log, ends and weights.
 
-    Parameters
-    ----------
-    start : array
-        t, x and p.
-    columns : int
-        Length of a row of the log.
+    `start` holds t, x and p; a row of the log has `columns` entries.
     """
 
     __slots__ = "_address", "_columns", "_end", "_ends", "_memory", "_most", "log", "numbers", "pointer", "weights"

@@ -14,20 +14,7 @@ def differentiable(function):
 
 
 def jacobian(function, by, t, x, p):
-    """∂y/∂x or ∂y/∂p of a compiled function y(t, x, p) at a point, exactly.
-
-    Parameters
-    ----------
-    function : Compiled
-    by : {"x", "p"}
-    t : float
-        [s]
-    x, p : (n_x,), (n_p,) arrays
-
-    Returns
-    -------
-    (n_y, n) array
-    """
+    """∂y/∂x or ∂y/∂p (n_y, n) of a compiled function y(t, x, p) at a point, exactly; `by` is "x" or "p"."""
     return np.array(_jacobian(function, by)(t, x, p))
 
 

@@ -15,19 +15,7 @@ PRODUCTS = 3e7  # multiplications of one call, some hundredths of a second: then
 
 
 def norms(matrices, scales):
-    """Largest sums of a row's magnitudes, of x/s.
-
-    Parameters
-    ----------
-    matrices : (N, n, n) array
-        x
-    scales : (n, n) array
-        s, of each entry.
-
-    Returns
-    -------
-    (N,) array
-    """
+    """Largest sums (N,) of a row's magnitudes, of matrices x (N, n, n) over scales s (n, n), entry by entry."""
     count, n, _ = matrices.shape
     call = _function("exponentials", "norms", count, N=n)
     if call is None:
@@ -38,21 +26,9 @@ def norms(matrices, scales):
 
 
 def exponentials(matrices, scales, squarings, terms):
-    """s exp(x/s 2^-k)^(2^k) by the Taylor series of some terms.
+    """s exp(x/s 2^-k)^(2^k) (N, n, n) by the Taylor series of some terms.
 
-    Parameters
-    ----------
-    matrices : (N, n, n) array
-        x
-    scales : (n, n) array
-        s, of each entry: powers of two.
-    squarings : (N,) array of int
-        k
-    terms : int
-
-    Returns
-    -------
-    (N, n, n) array
+    `matrices` x are (N, n, n), `scales` s (n, n), powers of two for each entry, and `squarings` k (N,).
     """
     count, n, _ = matrices.shape
     call = _function("exponentials", "exponentials", count, N=n)
@@ -81,19 +57,8 @@ def squared(matrices, squarings, terms):
 def riccati(A, B, Q, R, P, of_state=True):
     """H = R + BᵀPB and K = H⁻¹BᵀPA, then P = Q + AᵀP(A - BK), at one sample after another.
 
-    Parameters
-    ----------
-    A, B, Q : (N, n, n), (N, n, m), (N, n, n) arrays
-    R, P : (m, m), (n, n) arrays
-    of_state : bool
-        False: H⁻¹BᵀP in place of K.
-
-    Returns
-    -------
-    gains : (N, m, n) array
-    H : (N, m, m) array
-    P : (n, n) array
-        After the last sample.
+    A and Q are (N, n, n), B is (N, n, m), R (m, m) and the first P (n, n). Returned are the gains K (N, m, n), or
+    H⁻¹BᵀP unless `of_state`, H (N, m, m), and P after the last sample.
     """
     count, n, m = B.shape
     call = _function("riccati", "riccati", count, N=n, NU=m) if m else None

@@ -30,15 +30,8 @@ _BY_NUMBER = {ca.OP_NEG: -1.0, ca.OP_TWICE: 2.0}
 def scaled(statements):
     """Statements with gathered scales.
 
-    Parameters
-    ----------
-    statements : list of (target, operation, operands)
-        In single assignment: operands are values, which are numbered, constants, or C text of inputs.
-
-    Returns
-    -------
-    list of (target, operation, operands)
-        The same outputs, to rounding.
+    Statements (target, operation, operands) are in single assignment; operands are numbered values, constants, or C
+    text of inputs. The outputs are the same, to rounding.
     """
     gathered = _Gathered(statements)
     for statement in statements:

@@ -48,16 +48,8 @@ class Entry(NamedTuple):
 def tabulated(statements):
     """Statements with lookups in tables in place of sums over pieces, where that is shorter, and C texts of the tables.
 
-    Parameters
-    ----------
-    statements : list of (target, operation, operands)
-        In single assignment: operands are values, which are numbered, constants, or C text of inputs.
-
-    Returns
-    -------
-    statements : list of (target, operation, operands)
-        The same values, of which fewer are computed.
-    texts : list of str
+    Statements (target, operation, operands) are in single assignment; operands are numbered values, constants, or C
+    text of inputs. Fewer values are computed, and these are the same.
     """
     pieces = piecewise_constant(statements)
     others = (operands for target, _, operands in statements if target not in pieces)

@@ -48,15 +48,8 @@ LEAST = 1e-4  # duration, relative to that of the first motion
 class Curve:
     """The curve of a program: its residuals as functions of a parameter s from 0 to 1.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-    program : Program
-        Residuals h(q) - p(t), and others that hold along the curve at any speed.
-    t_span : (t0, t1)
-        [s]
-    values : dict of str to float
-        Parameters that differ from their defaults.
+    Residuals are h(q) - p(t), and others that hold along the curve at any speed. `t_span` is (t0, t1) [s], `values` are
+    the parameters that differ from their defaults.
     """
 
     def __init__(self, mechanism, program, t_span, values):
@@ -171,13 +164,7 @@ class Curve:
 class Inverse:
     """The exact inverse at one instant: equations between jets Z of the motion and c = (s, s', ...), and signals.
 
-    Parameters
-    ----------
-    curve : Curve
-    signals : sequence of str
-    values : dict of str to float
-        Parameters that differ from their defaults.
-    guess : dict of str to float, optional
+    `signals` are names, `values` the parameters that differ from their defaults.
     """
 
     def __init__(self, curve, signals, values, guess):
@@ -223,18 +210,10 @@ class Inverse:
 
 @frozen
 class Law:
-    """A law s(t): s^(k) at the ends of N equal intervals of a duration, between which it is linear.
+    """A law s(t): s^(k) at the ends of N equal intervals of a duration, between which it is linear."""
 
-    Attributes
-    ----------
-    duration : float
-        [s]
-    jets : (k + 1, N + 1) array
-        s, s' T, ..., s^(k) T^k.
-    """
-
-    duration: float
-    jets: np.ndarray
+    duration: float  # T [s]
+    jets: np.ndarray  # (k + 1, N + 1): s, s' T, ..., s^(k) T^k
 
     def expression(self, t, t0):
         """s as an SX of a time that begins at t0 [s]; before and after it rests."""
@@ -294,17 +273,8 @@ class Problem:
     """The nonlinear program of a curve.
 
     Unknowns: the duration, the jets of s at the ends of the intervals (k + 1, N + 1), the jets of the motion at all
-    nodes (n_z, N S), each in units of its size.
-
-    Parameters
-    ----------
-    inverse : Inverse
-    limits : (low, high) of (m,) arrays
-        Of the signals of the inverse.
-    law : Law
-        Of a motion within the limits.
-    plan : Run
-        This motion.
+    nodes (n_z, N S), each in units of its size. `limits` (low, high), (m,) each, are those of the inverse's signals;
+    the search begins at `law` with its motion `plan`, which is within them.
     """
 
     def __init__(self, inverse, limits, law, plan):

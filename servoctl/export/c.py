@@ -339,18 +339,9 @@ def _schedule(rows, thinned):
 def thin(rows, bound):
     """Rows between which cubic polynomials give all others.
 
-    Parameters
-    ----------
-    rows : (N, width) array
-    bound : float
-        Largest error of an entry, relative to its largest magnitude over all rows.
-
-    Returns
-    -------
-    knots : (K,) int array
-        The rows, with the first and the last.
-    slopes : (N, width) array
-        Changes from row to row.
+    From rows (N, width): the indices (K,) of those between which they lie, with the first and the last, and the slopes
+    (N, width) of all, changes from row to row. `bound` is the largest error of an entry, relative to its largest
+    magnitude over all rows.
     """
     slopes, allowed = np.gradient(rows, axis=0), bound * np.abs(rows).max(axis=0)
     knots = [0]

@@ -28,22 +28,13 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 class Array:
     """An array of the interface, with an enum of its indices.
 
-    Parameters
-    ----------
-    key : str
-        Name as an argument: p gives the indices `CRANE_P_m_load` and the length `CRANE_NP`.
-    about : str
-        Description in the header.
-    names : sequence of str
-        Names of the entries.
-    units : dict of str to str
-        Known units by name (`servoctl.units`), for comments.
+    Its `key` is its name as an argument: p gives the indices `CRANE_P_m_load` and the length `CRANE_NP`.
     """
 
     key: str
-    about: str
-    names: tuple
-    units: dict = field(default_factory=dict)
+    about: str  # description in the header
+    names: tuple  # of the entries
+    units: dict = field(default_factory=dict)  # those that are known, by name (`servoctl.units`), for comments
 
     def length(self, prefix):
         """C constant with its length."""
@@ -85,20 +76,11 @@ class Scalar:
 
 @frozen
 class Constant:
-    """Numbers written into the C file.
+    """Numbers written into the C file."""
 
-    Parameters
-    ----------
-    name : str
-        C name; a public constant has the prefix and an underscore before it.
-    values : float or (N,) array
-    about : str
-        Description in the header; "" for a constant that is not public.
-    """
-
-    name: str
-    values: object
-    about: str = ""
+    name: str  # in C; a public constant has the prefix and an underscore before it
+    values: object  # float or (N,) array
+    about: str = ""  # description in the header; "" for a constant that is not public
 
     @property
     def kind(self):
@@ -121,22 +103,12 @@ class Constant:
 
 @frozen
 class Routine:
-    """A public C function, which calls the static function of the same name.
+    """A public C function, which calls the static function of the same name."""
 
-    Parameters
-    ----------
-    name : str
-        Name after the prefix and an underscore.
-    about : str
-        Description in the header.
-    arguments : sequence of Argument and Scalar
-    result : {"void", "int"}
-    """
-
-    name: str
-    about: str
-    arguments: tuple
-    result: str = "void"
+    name: str  # after the prefix and an underscore
+    about: str  # description in the header
+    arguments: tuple  # of Argument and Scalar
+    result: str = "void"  # "void" or "int"
 
     def declaration(self, prefix):
         """C declaration without a semicolon."""
@@ -151,39 +123,20 @@ class Routine:
 
 @frozen
 class Contents:
-    """Contents of a C file and its header.
+    """Contents of a C file and its header."""
 
-    Parameters
-    ----------
-    arrays : sequence of Array
-    constants : sequence of Constant
-    functions : dict of str to casadi.Function
-        Static functions by name, SX functions of (t, x, p) with one dense column.
-    routines : sequence of Routine
-    sources : sequence of str
-        Files of the folder `sources`, and headers of `codegen/c`, with further static functions, which may call
-        `functions`.
-    sizes : dict of str to float
-        Macros of these files.
-    """
-
-    arrays: tuple
-    constants: tuple
-    functions: dict
-    routines: tuple
-    sources: tuple = ()
-    sizes: dict = field(default_factory=dict)
+    arrays: tuple  # of Array
+    constants: tuple  # of Constant
+    functions: dict  # static ones by name: SX functions of (t, x, p) with one dense column
+    routines: tuple  # of Routine
+    sources: tuple = ()  # files of the folder `sources`, and headers of `codegen/c`, whose functions may call these
+    sizes: dict = field(default_factory=dict)  # macros of the sources, by name
 
 
 def write(folder, name, contents, real="double"):
     """Write NAME.c and NAME.h; their two paths. `name`, a C identifier, is the prefix of all public names.
 
-    `real` is the type of all numbers, "double" or "float".
-
-    Raises
-    ------
-    ServoError
-        If the files cannot be written.
+    `real` is the type of all numbers, "double" or "float". Raises ServoError if the files cannot be written.
     """
     texts = {f"{name}.c": _source(name, contents), f"{name}.h": _header(name, contents)}
     convert = _doubles if real == "double" else _floats

@@ -259,15 +259,8 @@ class NoMotion(Exception):
 class Motions:
     """The motions of a model by its parameters.
 
-    Parameters
-    ----------
-    model : Model
-    names : tuple of str
-        Of the parameters that are varied.
-    span : (float, Function)
-        t0, and the function of all parameters that gives t1 and its derivatives.
-    known : (dict, dict or None)
-        Values of the start that are held, and a guess.
+    `names` are those of the k parameters that are varied; `span` is t0 [s] and a function of all parameters that gives
+    t1 and its derivatives by the varied ones; `known` has the values of the start that are held, and a guess or None.
     """
 
     def __init__(self, model, names, span, known):
@@ -402,13 +395,8 @@ class Evaluated:
 class Search:
     """The nonlinear program; unknown are the parameters in units of their ranges.
 
-    Parameters
-    ----------
-    motions : Motions
-    ranges : (k, 2) array
-    minimise : str
-    sizes : dict of str to float
-    limits : dict of str to (float, float)
+    `ranges` (k, 2) are those of the parameters; `minimise` is "rms", "peak" or "time". Signals count relative to their
+    `sizes`, by name, and stay within their `limits`, (low, high) by name.
     """
 
     def __init__(self, motions, ranges, minimise, sizes, limits):
@@ -657,13 +645,8 @@ class Search:
 class NonlinearProgram:
     """The cost and the inequalities of x = v, or of x = (v, z) with a bound z of all magnitudes or excesses.
 
-    Parameters
-    ----------
-    search : Search
-    what : str
-        "rms", "peak", "time", or "excess": the largest one over limits.
-    v : (k,) array
-        Where the search begins; costs are relative to the one there.
+    `what` is "rms", "peak", "time", or "excess", the largest one over limits. Costs, but for an excess, are relative to
+    the one at v (k,), where the search begins.
     """
 
     def __init__(self, search, what, v):

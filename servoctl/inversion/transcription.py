@@ -47,13 +47,7 @@ WARM = {
 class Node:
     """Expressions at an instant t, of the state x and of v = (u, u', ...), with the numbers of a plant inserted.
 
-    Parameters
-    ----------
-    plant : Plant
-        Whose inputs act at once.
-    program : Program
-    bounded : dict of str to SX
-        Quantities with bounds, in symbols of the plant's mechanism.
+    The plant's inputs act at once. `bounded` has the quantities with bounds by name, in symbols of its mechanism.
     """
 
     def __init__(self, plant, program, bounded):
@@ -94,18 +88,10 @@ class Node:
 
 @frozen
 class Mesh:
-    """Intervals and the nodes in them.
+    """Intervals and the nodes in them."""
 
-    Attributes
-    ----------
-    edges : (N + 1,) array
-        [s]
-    order : int
-        Of the Radau method with s nodes.
-    """
-
-    edges: np.ndarray
-    order: int
+    edges: np.ndarray  # (N + 1,) [s]
+    order: int  # of the Radau method with s nodes
 
     @cached_property
     def c(self):
@@ -180,21 +166,12 @@ def bernstein(s, theta, rate=0):
 class Transcription:
     """The nonlinear program of one mesh; weights, bounds and the ends are data of each solution.
 
-    Unknowns are states at the start and all nodes (n_x, 1 + N s) and control points of the inputs (m, 1 + P s), each in
-    units of its size. Constraints by kind: "motion" (n_x, N s), collocation; "begin" (m, 1), the highest coefficient of
-    the inputs on the first interval, whose begin is no node; "slope" (m, P s), control points of u'; "bound" (b, P w);
-    "start" and "rest" (r, 1).
-
-    Parameters
-    ----------
-    node : Node
-    mesh : Mesh
-        Of the states, N intervals.
-    pieces : Mesh
-        Of the inputs, P intervals, each of one or several of the states'.
-    sizes : (x, u, bounded, effort) of (n_x,), (m,), (b,) arrays and float
-    start, rest : Function, optional
-        What vanishes at the start, of (t, x), and at the end, of (t, x, v).
+    Unknowns are states at the start and all nodes (n_x, 1 + N s) of `mesh`, and control points of the inputs
+    (m, 1 + P s) on `pieces`, each of one or several intervals of the former; N and P are the numbers of intervals.
+    `sizes` are the units of the states (n_x,), inputs (m,), bounded quantities (b,) and effort. Constraints by kind:
+    "motion" (n_x, N s), collocation; "begin" (m, 1), the highest coefficient of the inputs on the first interval, whose
+    begin is no node; "slope" (m, P s), control points of u'; "bound" (b, P w); "start" and "rest" (r, 1), functions
+    that vanish at the start, of (t, x), and at the end, of (t, x, v).
     """
 
     def __init__(self, node, mesh, pieces, sizes, start=None, rest=None):
@@ -272,23 +249,11 @@ class Transcription:
         return {}
 
     def solve(self, w, beta, bounds, multipliers=None):
-        """Solve from an approximation of the variables.
+        """Variables w (n_w,), multipliers and statistics of the solution that is found from an approximation w.
 
-        Parameters
-        ----------
-        w : (n_w,) array
-        beta : (k,) array
-            Weights of the residuals.
-        bounds : (lower, upper, {kind: (lower, upper)})
-            Of the variables (n_w,), and of the constraints by kind, as arrays (rows, instants).
-        multipliers : (bounds, constraints), optional
-            Of a nearby solution, where this one begins.
-
-        Returns
-        -------
-        w : (n_w,) array
-        multipliers : (bounds, constraints)
-        stats : dict
+        `beta` (k,) divides the squares of the residuals. `bounds` is (lower, upper, {kind: (lower, upper)}) of the
+        variables (n_w,) and of the constraints, as arrays (rows, instants). Multipliers are pairs, of bounds and of
+        constraints; those passed are of a nearby solution, where this one begins.
         """
         warm = multipliers is not None
         lower, upper, limits = bounds

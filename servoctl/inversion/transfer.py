@@ -23,15 +23,9 @@ STANDING = 1e-6  # rate of a program that stands still, relative to its largest
 
 @frozen
 class Near:
-    """A start in motion whose unstable modes are open, so that the plan begins on its bounded motion.
+    """A start in motion whose unstable modes are open, so that the plan begins on its bounded motion."""
 
-    Attributes
-    ----------
-    state : State
-        Of the model of the program, near which the plan begins.
-    """
-
-    state: State
+    state: State  # of the model of the program, near which the plan begins
 
     @property
     def names(self):
@@ -42,30 +36,12 @@ class Near:
 class Transfer:
     """A plant, a program, the limits and bounds of a plan, and its ends.
 
-    Parameters
-    ----------
-    plant : Plant
-        Whose inputs act at once.
-    program : Program
-    span : (t0, t1)
-        [s]
-    limits : (magnitudes, rates)
-        {actuator: (low, high)} each.
-    bounds, start, end
-        As for `relaxed`.
-
-    Attributes
-    ----------
-    begin : (n_x,) array
-        The state at t0, or one near it.
-    opening : Function or None
-        Of (t, x), which vanishes at a start that is open.
-    held : (m,) array or None
-        The inputs that hold it at rest.
-    target : (state (n_x,), inputs (m,) or None, Function or None)
-        What is fixed at t1: NaN where the state is open; a function of (t, x, v) that vanishes.
-    states, inputs, sizes
-        The guess (n_x, G) and (m, G) at equal instants, and the sizes that `Transcription` takes.
+    Inputs of the plant act at once; `limits` are those of magnitudes and of rates, {actuator: (low, high)} each;
+    `bounds`, `start` and `end` are as for `relaxed`. The state at t0 is `begin` (n_x,), or near it where it is open,
+    and then `opening`, of (t, x), vanishes there; `held` (m,) are the inputs that hold it at rest, None if it may move.
+    `target` is what is fixed at t1: state (n_x,), NaN where it is open, inputs (m,) or None, and a function of
+    (t, x, v) that vanishes, or None. `states` (n_x, G) and `inputs` (m, G) are the guess at equal instants, `sizes`
+    those that `Transcription` takes.
     """
 
     def __init__(self, plant, program, span, limits, bounds, start, end):

@@ -96,15 +96,8 @@ def _finite(value):
 def verdict(model: Model, motion: Run | State | None = None) -> Verdict:
     """The verdict on a model's program.
 
-    Parameters
-    ----------
-    model : Model
-    motion : Run or State, optional
-        A run, judged at its ends and along it, or a start. Default: the start near the guess of `derive`.
-
-    Returns
-    -------
-    Verdict
+    A run is judged at its ends and along it, a `State` as the start of a motion; by default it is the start near the
+    guess of `derive`.
     """
     program, actuators = model.reduction.program, model.actuators
     if not program.residuals:
@@ -176,17 +169,7 @@ def _starting(model, motion):
 
 
 def endpoints(model, motion):
-    """(t, state (n_x,)) where a run, or the motion from a start, begins and ends as far as known; none if no start is.
-
-    Parameters
-    ----------
-    model : Model
-    motion : Run, State or None
-
-    Returns
-    -------
-    list of (float, array)
-    """
+    """A list of (t, state (n_x,)) where a run begins and ends, or a motion begins; empty if no start is known."""
     try:
         return _starting(model, motion)
     except ServoError:

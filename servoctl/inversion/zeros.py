@@ -27,12 +27,8 @@ MOVED = 1e-6  # distance of an equilibrium from the state that was passed, and i
 class ZeroPolynomial:
     """det Z of a program at its equilibria, by the value of a parameter.
 
-    Parameters
-    ----------
-    model : Model
-    parameter : str
-    at : State
-        An equilibrium under the model's own value.
+    `at` is an equilibrium under the model's own value; a state that is none is refused, as is a program that moves
+    there.
     """
 
     def __init__(self, model, parameter, at):

@@ -23,12 +23,7 @@ class _Undecided(Exception):
 
 
 def cancels(expression):
-    """Whether all terms of an SX scalar cancel; False where that is not decided.
-
-    Parameters
-    ----------
-    expression : SX scalar
-    """
+    """Whether all terms of an SX scalar cancel; False where that is not decided."""
     f = ca.Function("cancels", [], [expression], {"allow_free": True, "live_variables": False})
     if f.n_instructions() > MOST_OPERATIONS:
         return False

@@ -29,30 +29,14 @@ _NARROW = 0.5**0.5  # an angle is followed up to 135° on either side of its bra
 
 
 class Switch(NamedTuple):
-    """A decision that the motion may change.
+    """A decision that the motion may change."""
 
-    Attributes
-    ----------
-    branch : SX
-        The parameter b.
-    function : SX
-        The switching function, which is not negative where b is right.
-    other : SX
-        The branch beyond its zero.
-    text : str
-        Where it changes, in the designer's names.
-    angle : bool
-        Whether b counts half turns, instead of sides.
-    rests : bool
-        Whether b = 1/2 stands for the zero of the switching function itself: |0| = 0 and sign 0 = 0.
-    """
-
-    branch: ca.SX
-    function: ca.SX
-    other: ca.SX
-    text: str
-    angle: bool = False
-    rests: bool = False
+    branch: ca.SX  # the parameter b
+    function: ca.SX  # the switching function, which is not negative where b is right
+    other: ca.SX  # the branch beyond its zero
+    text: str  # where it changes, in the designer's names
+    angle: bool = False  # whether b counts half turns, instead of sides
+    rests: bool = False  # whether b = 1/2 stands for the zero of the switching function itself: |0| = 0 and sign 0 = 0
 
 
 def has_switches(expressions):

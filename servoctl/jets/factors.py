@@ -18,15 +18,7 @@ class _Product:
 def constants_outside(tape, constants):
     """A tape whose products of series have no constant factors inside, and are the same for the same factors.
 
-    Parameters
-    ----------
-    tape : Tape
-    constants : set of int
-        Indices of the inputs that are constant.
-
-    Returns
-    -------
-    Tape
+    `constants` is the set of the indices of the inputs that are constant.
     """
     result = copy(tape)
     for cached in ("plan", "growing", "_plans"):

@@ -50,14 +50,7 @@ OPERATIONS = VALUE | {
 def spread(expressions):
     """Values of SX scalars at random points of all their symbols, with functions substituted; rounding is zero.
 
-    Parameters
-    ----------
-    expressions : sequence of SX scalars
-
-    Returns
-    -------
-    (len(expressions), points) array
-        NaN where a root or a quotient has no value.
+    An array (len(expressions), points), NaN where a root or a quotient has no value, or sizes exceed `LARGEST`.
     """
     tape, rng = Tape(None, expressions), np.random.default_rng(IDENTITY_POINTS_SEED)
     shape = len(tape.symbols), len(SCALES)

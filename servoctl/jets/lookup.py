@@ -24,10 +24,7 @@ _contents = {}  # by the same name
 class Lookup:
     """The number of knots that s has reached, or the entry of a list at a place.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Made by `of_knots` or `of_entries`.
+    Its function is one that `of_knots` or `of_entries` has made.
     """
 
     def __init__(self, function):

@@ -19,27 +19,12 @@ _LOGS = {ca.OP_LOG, ca.OP_LOG1P}
 
 
 class _Degrees:
-    """Degrees of the values of expressions in e^s, where s goes to infinity in one direction.
+    """Degrees of the values of expressions in e^s, where s goes to infinity in one direction, 1 or -1.
 
-    An exponent is a factor times s, whatever that is.
-
-    Parameters
-    ----------
-    direction : {1, -1}
-
-    Attributes
-    ----------
-    values : list of SX
-    of : list of dict
-        For each value its degrees by s, in the form of its place; without those that are zero.
-    scaled : list of (int, float)
-        For each value the place and the factor of which it is the product.
-    grows : set of int
-        Each s in which a value is not bounded, or whose exponentials are mixed with others.
-    factors : dict of int to set of float
-        Of the exponents in each s.
-    logs : dict of int to int
-        Places of log(c + e^a) with those of a.
+    An exponent is a factor times s, whatever that is; s goes by the place of its value. Each value has in `of` its
+    degrees by s, without zeros, and in `scaled` the place and the factor of which it is the product. `grows` has each s
+    in which a value is not bounded, or whose exponentials are mixed with others, `factors` the factors of the exponents
+    in each s, `logs` the places of log(c + e^a) with those of a.
     """
 
     def __init__(self, direction):
@@ -139,16 +124,9 @@ class _Degrees:
 
 
 def settled(expressions):
-    """Expressions with exponents that stay at `LAST_EXPONENT` beyond it, where these have their limits there.
+    """SX scalars whose exponents stay at `LAST_EXPONENT` beyond it, where they have their limits there.
 
-    Parameters
-    ----------
-    expressions : list of SX scalars
-
-    Returns
-    -------
-    list of SX scalars
-        The same where there is no such exponent.
+    Without any such exponent they are returned as they are.
     """
     if not expressions or not _has_growing(expressions):
         return expressions

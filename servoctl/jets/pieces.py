@@ -55,16 +55,8 @@ class Pieces(NamedTuple):
 def by_pieces(tape, kept=()):
     """The nodes of a tape, for numbers, with piecewise constant ones as functions of their s in place of sums.
 
-    Parameters
-    ----------
-    tape : Tape
-    kept : iterable of int
-        Nodes that are read, besides those of the outputs.
-
-    Returns
-    -------
-    list of Node
-        As many; those that others do not need any more are zero.
+    There are as many as before; those that others do not need any more are zero. `kept` are nodes that are read,
+    besides those of the outputs.
     """
     statements = [(i, *_statement(tape.nodes, node)) for i, node in enumerate(tape.nodes) if node.kind != "const"]
     pieces = piecewise_constant(statements)

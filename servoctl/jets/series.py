@@ -58,20 +58,9 @@ def _inner_first(k):
 class Series:
     """A tape run on truncated power series, one coefficient at a time.
 
-    Parameters
-    ----------
-    tape : Tape
-    inputs : list of list
-        Coefficients of each input; before `advance()` computes coefficient k, at least k + 1 of them.
-    decided : dict of int to value, optional
-        Values of nodes by which branches are taken. Default: coefficient 0 of the compared nodes.
-
-    Attributes
-    ----------
-    c : list of list
-        The coefficients of each node so far.
-    k : int
-        Their number.
+    `inputs` has a list of coefficients for each input: before `advance()` computes coefficient k, at least k + 1 of
+    them. Branches are taken by the values of nodes in `decided`, a dict, or else by their coefficients 0. `c` has the
+    coefficients of each node so far, `k` is their number.
     """
 
     def __init__(self, tape, inputs, decided=None):
@@ -208,15 +197,7 @@ class Series:
 class _Grouped(Series):
     """A tape run on series of numbers at many points, a group of equal operations at a time: (size, N) arrays.
 
-    Parameters
-    ----------
-    tape : Tape
-    inputs : list of list of arrays (N,) or numbers
-        Coefficients of each input.
-    first : int or None
-        How many of the tape's outputs are computed; None for all.
-    n_points : int
-        N.
+    Coefficients of inputs are (N,) arrays or numbers. `first` is how many of the outputs are computed, None for all.
     """
 
     def __init__(self, tape, inputs, first, n_points):
@@ -254,10 +235,6 @@ class Motion:
     """The normalised Taylor coefficients of every symbol along a motion.
 
     Subclasses define `coordinate(i, j)`, coefficient j of q_i, and `velocity(i, l, j)`, coefficient j of γ_i^(l).
-
-    Parameters
-    ----------
-    q : Coordinates
     """
 
     def __init__(self, q):
@@ -281,19 +258,10 @@ def shifted(c, level, j):
 class Flow:
     """Rows along a motion: Taylor coefficients of the residuals, and their Jacobian in the jets.
 
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-        Each contributes its coefficients 0 .. level - order.
-    level : int
-        Highest level K of the jets.
-    points : Points
-        Its parameters, their values, and its book of scalars.
-    signals : dict, optional
-        Taylor coefficients of further symbols along the motion, by element hash: lists of (N,) arrays.
-    real : type
-        Type of the Jacobian; double precision is enough for Newton's method.
+    `level` is the highest level K of the jets; a row contributes its coefficients 0 .. level - order. `points` has the
+    parameters with their values, and the book of scalars. `signals` are Taylor coefficients of further symbols along
+    the motion by element hash, lists of (N,) arrays. `real` is the type of the Jacobian; double precision is enough for
+    Newton's method.
     """
 
     def __init__(self, q, rows, level, points, signals=None, real=float):

@@ -163,29 +163,12 @@ _OPTIONS = {"allow_free": True, "live_variables": False, "max_io": 10**9}  # ope
 
 
 class Tape:
-    """The primitive operations that compute `expressions`.
+    """The primitive operations that compute `expressions`, SX scalars.
 
-    Parameters
-    ----------
-    symbols : sequence of SX scalars or None
-        The inputs, in the order of their values. Default: all symbols of the expressions.
-    expressions : sequence of SX scalars
-        The outputs.
-
-    Attributes
-    ----------
-    symbols : list of SX scalars
-    nodes : list of Node
-        Each takes nodes before it, except the slopes of "quad" nodes.
-    outputs : list of int
-        Nodes of the expressions.
-    switches : list of (int, int or None)
-        Differences whose sign decides a branch.
-
-    Raises
-    ------
-    SpecificationError
-        If an expression holds an operation that has no derivative (floor, fmod, ...).
+    `symbols` are the inputs in the order of their values, by default all symbols of the expressions. Each node takes
+    nodes before it, except the slopes of "quad" nodes; `outputs` are the nodes of the expressions, and `switches` pairs
+    of nodes whose difference decides a branch by its sign, (node, None) for a node itself. Raises SpecificationError
+    for an operation that has no derivative (floor, fmod, ...).
     """
 
     def __init__(self, symbols, expressions):
@@ -385,19 +368,10 @@ class Tape:
 class Plan:
     """An order of a tape's nodes in which each group of equal operations is evaluated by one call of NumPy.
 
-    Parameters
-    ----------
-    nodes : list of Node
-
-    Attributes
-    ----------
-    place : (n_nodes,) array of int
-        Place of each node in this order.
-    constants, inputs : (places, values) and (places, indices)
-    groups : list of (kind, data, slice, (operands, size) array)
-        Operation, its places, and the places of its operands. Squares are products here.
-    slopes : dict of int to list of (size,) arrays
-        For a group of kind "quad", by its first place: the places of dy/da for each operand.
+    `place` (n_nodes,) is the place of each node in it. `constants` are (places, values), `inputs` (places, indices),
+    and `groups` (kind, data, slice of places, places of the operands (operands, size)), with squares as products.
+    `slopes` has for each group of kind "quad", by its first place, the places of dy/da for each operand, (size,)
+    arrays.
     """
 
     def __init__(self, nodes):
@@ -528,25 +502,13 @@ _SIZE = {  # from the magnitude of y, and values and sizes of the operands
 
 
 def evaluate(tape, inputs, operations=None):
-    """Values of a tape's outputs and the sizes of their terms.
+    """Values of a tape's outputs and the sizes of their terms, (n_outputs, N), for inputs (n_inputs, N).
 
     The size of a + b is the root of the sum of squares of size(a) and size(b), as for independent errors, and at least
     |a + b|; that of a b is the same root for |a| size(b) and size(a) |b|, that of y = f(a) is |y| + |f'(a)| size(a).
     Rounding errors are about the machine's epsilon times the size, so an output far below its size is zero. Sums
     instead of roots would grow exponentially along a chain of rotations, whose errors do not. The precision is that of
-    `inputs`.
-
-    Parameters
-    ----------
-    tape : Tape
-    inputs : (n_inputs, N) array
-        Values of the inputs at N points.
-    operations : dict of str to callable, optional
-        Functions by kind of node; default: `VALUE`.
-
-    Returns
-    -------
-    values, sizes : (n_outputs, N) arrays
+    `inputs`; `operations` are functions by kind of node, by default `VALUE`.
     """
     outputs = tape.plan.place[tape.outputs]
     with np.errstate(all="ignore"):
@@ -557,19 +519,8 @@ def evaluate(tape, inputs, operations=None):
 class Scalars:
     """SX scalars on one tape, with the places of their symbols in jet space.
 
-    Parameters
-    ----------
-    q : Coordinates
-    parameters : tuple of SX
-    expressions : sequence of SX scalars
-    others : collection of int, optional
-        Element hashes of symbols outside jet space, which are evaluated as zero.
-
-    Attributes
-    ----------
-    tape : Tape
-    places : list
-        What each symbol is; see `Coordinates.where`.
+    `places` says what each symbol is; see `Coordinates.where`. `others` are element hashes of symbols outside jet
+    space, besides the parameters, which are evaluated as zero.
     """
 
     def __init__(self, q, parameters, expressions, others=()):
@@ -627,16 +578,7 @@ class Book:
     def find(self, q, parameters, expressions):
         """The scalars that hold expressions; expressions that no call has seen before share a new tape.
 
-        Parameters
-        ----------
-        q : Coordinates
-        parameters : tuple of SX
-        expressions : sequence of SX scalars
-
-        Returns
-        -------
-        list of (Scalars, list of int, list of int)
-            Scalars that hold some of the expressions, the indices among them, and the indices in `expressions`.
+        A list of (Scalars, indices among them, indices in `expressions`).
         """
         hashes = [e.element_hash() for e in expressions]
         new = {h: e for h, e in zip(hashes, expressions, strict=True) if h not in self._places}

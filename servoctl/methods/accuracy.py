@@ -31,21 +31,11 @@ COARSEST_ACCURACY, FINEST_ACCURACY = 1e-1, 1e-13  # accuracies that make sense i
 
 
 def relative_error(values, reference, levels=None):
-    """Largest deviation over components and instants, each component relative to its size.
+    """Largest deviation of values (n, N) over components and instants, each component relative to its size.
 
     The size of a component is its largest magnitude in the reference, at least 1e-3 of the largest component of the
-    same level (positions, velocities, ..., in SI and radians); 1 where the whole level is zero.
-
-    Parameters
-    ----------
-    values, reference : (n, N) arrays
-    levels : (n,) array of int, optional
-        Level of each component; default: all the same.
-
-    Returns
-    -------
-    float
-        NaN where a value is not finite.
+    same level (positions, velocities, ..., in SI and radians); 1 where the whole level is zero. Without levels (n,) all
+    components are of one. The result is NaN if a value is.
     """
     if not np.size(reference):
         return 0.0
@@ -66,13 +56,7 @@ def component_sizes(values, levels, least=SMALLEST_SIZE):
 def large_tolerances(model, t, x):
     """Absolute tolerances (n_x,) for a motion that starts so large that the default is rounding of it; else None.
 
-    Parameters
-    ----------
-    model : Model
-    t : (t0, t1)
-        Span of the motion [s].
-    x : (n_x,) array
-        State at its start.
+    Its span is t = (t0, t1) [s], and x (n_x,) the state at its start.
     """
     sizes = motion_sizes(model, np.asarray(t, dtype=float), np.column_stack([x, x]))
     return ATOL * np.where(sizes > LARGE, sizes, 1.0) if sizes.max() > LARGE else None
@@ -94,18 +78,9 @@ def absolute_tolerances(sizes, rtol):
 def unlike_tolerances(levels, largest, sizes, atol=None):
     """Absolute tolerances (n_x,) for entries of a level that are too unlike for one of the level; else None.
 
-    As places in micrometres beside angles. What the inertia makes of an entry tells a small one from rounding.
-
-    Parameters
-    ----------
-    levels : (n_x,) array of int
-        From `state_levels`.
-    largest : (n_x,) array
-        Magnitudes of the entries along the motion.
-    sizes : (n_x,) array
-        The same in the metric of the inertia, from `sizes_of`.
-    atol : float, optional
-        The tolerance of the largest entries of each level. Default: 1e-11 of each entry.
+    As places in micrometres beside angles. `largest` (n_x,) are the magnitudes of the entries along the motion, and
+    `sizes` (n_x,), from `sizes_of`, what the inertia makes of them, which tells a small entry from rounding. `atol` is
+    the tolerance of the largest entries of each level; without it each entry has 1e-11 of its own size.
     """
     if not unlike(levels, largest, sizes):
         return None
@@ -127,18 +102,7 @@ def _of_level(levels, largest):
 
 
 def motion_error(model, jets, reference):
-    """Error of a motion: `relative_error` of its state X = (q, γ', ..., γ^(s̄-1)).
-
-    Parameters
-    ----------
-    model : Model
-    jets, reference : (n_z, N) arrays
-        Jets at the same instants.
-
-    Returns
-    -------
-    float
-    """
+    """The `relative_error` of a motion's state X = (q, γ', ..., γ^(s̄-1)), from jets (n_z, N) at the same instants."""
     n_x = len(model.state_names)
     return relative_error(jets[:n_x], reference[:n_x], state_levels(model))
 
@@ -163,34 +127,12 @@ def _with_fallback(simulated, method):
 
 
 def accurate(simulated, model, accuracy, method=None, drift=None):
-    """The motion with an error of at most `accuracy`.
+    """The motion with a `motion_error` of at most `accuracy`; `simulated` gives a run from a method and a drift.
 
-    A flat program is solved to rounding at each instant. Otherwise the tolerance is lowered until two successive
-    motions agree to `accuracy`; the one of the lower tolerance is returned.
-
-    Parameters
-    ----------
-    simulated : callable
-        Run from a method and a treatment of drift.
-    model : Model
-    accuracy : float
-        See `motion_error`.
-    method : None or Taylor
-        `Taylor(jets=...)` sets the jets; order and tolerances follow from the accuracy.
-    drift : None
-        Follows from the accuracy.
-
-    Returns
-    -------
-    Run
-        Its message states the difference.
-
-    Raises
-    ------
-    SpecificationError
-        If the accuracy is out of range, or combined with what it determines.
-    LimitExceeded
-        If rounding errors exceed it; `.run` is the best motion.
+    A flat program is solved to rounding at each instant. Otherwise, or with jets, the tolerance is lowered until two
+    successive motions agree to `accuracy`; the one of the lower tolerance is returned, and its message states the
+    difference. Only `Taylor(jets=...)` may be given, since all else follows from the accuracy. LimitExceeded is raised
+    if rounding errors exceed it; its `.run` is the motion of the lowest tolerance.
     """
     accuracy, jets = require_accuracy(accuracy), _jets_alone(accuracy, method, drift)
     method = method_for(model, accuracy, jets)

@@ -18,26 +18,9 @@ BLOCK = 4000  # samples per call of the loop: 0.2 ms compiled, 0.2 s where CasAD
 
 
 def algebraic(model, span, x0, times, knots, progress, events=None):
-    """Solve a flat program for q, γ' and γ'' at each time.
+    """Solve a flat program (Σ o_a = 0) for q, γ' and γ'' at each of the times (N,), in the order of the motion [s].
 
-    Parameters
-    ----------
-    model : Model
-        With Σ o_a = 0.
-    span : (t0, t1)
-        [s]
-    x0 : (n_x,) array
-        State at t0; Newton's method starts from its q.
-    times : (N,) array
-        In the order of the motion [s].
-    knots : sequence of float
-        At which steps end [s].
-    progress : callable
-    events : Events, optional
-
-    Returns
-    -------
-    Motion
+    Newton's method starts from the q of x0, the state at t0; steps end at the knots [s].
     """
     continuation = _Algebraic(model, "algebraic", None, progress)
     continuation.events = events

@@ -47,35 +47,13 @@ BETWEEN = (0.15, 0.5, 0.9)  # places within an interval where the defect is meas
 
 
 def bounded(model, span, guess, method, instants, progress, events=None):
-    """The bounded motion of a program.
+    """The bounded motion of a program that stands still outside its span; its `note` has window and truncation error.
 
-    Parameters
-    ----------
-    model : Model
-    span : (t0, t1)
-        Outside it the program stands still [s].
-    guess : (n_x,) array
-        Where Newton's method for the first equilibrium begins.
-    method : Bounded
-    instants : (times, knots)
-        Times of the samples [s], None for 1001 instants of the whole window and the knots; and the instants where the
-        program is not smooth [s].
-    progress : callable
-    events : Events, optional
-
-    Returns
-    -------
-    Motion
-        Its `note` has the window and the error of its truncation.
-
-    Raises
-    ------
-    UnstableInternalDynamics
-        If an eigenvalue lies on the imaginary axis at an end, or the ends differ in the number of unstable ones.
-    SpecificationError
-        If the program does not stand still outside the span.
-    IntegrationStopped, SingularProgram
-        If there is no equilibrium, Newton's method does not converge, or a pivot vanishes.
+    `guess` (n_x,) is where Newton's method for the first equilibrium begins. `instants` are (times, knots): the samples
+    [s], None for 1001 in the whole window, the ends of the span and the knots; and where the program is not smooth [s].
+    Raises UnstableInternalDynamics if an eigenvalue lies on the imaginary axis at an end, or the ends differ in the
+    number of unstable ones, SpecificationError if the program moves outside the span, and IntegrationStopped or
+    SingularProgram if there is no equilibrium, Newton's method does not converge, or a pivot vanishes.
     """
     times, knots = instants
     if span[1] < span[0]:
@@ -244,13 +222,7 @@ class End:
 class FreeEntries:
     """The internal dynamics z' = f(t, z) in entries z of the state that the invariants leave free.
 
-    Parameters
-    ----------
-    model : Model
-    t : float
-        [s]
-    guess : (n_x,) array
-        A state near which the entries are chosen.
+    They are chosen near the state `guess` (n_x,) at t [s].
     """
 
     def __init__(self, model, t, guess):
@@ -551,17 +523,10 @@ class Problem(FreeEntries):
     def linear(self, h, A, right, at_ends):
         """Solve the collocated ζ' = A ζ + b for k right sides: ζ (1 + N s, f, k) at the start and at all nodes.
 
-        Stages are eliminated interval by interval, then the ends of the intervals are solved for.
-
-        Parameters
-        ----------
-        h : (N,) array
-            Lengths of the intervals [s].
-        A : (1 + N s, f, f) array
-        right : (N s, f, k) array
-            h b at the nodes.
-        at_ends : two (f, k) arrays
-            What the stable components at the start, and the unstable ones at the end, are those of.
+        Stages are eliminated interval by interval, then the ends of the intervals are solved for. The intervals have
+        the lengths h (N,) [s], A is (1 + N s, f, f), and `right` (N s, f, k) is h b at the nodes. ζ has the stable
+        components of the first of `at_ends`, two (f, k) arrays, at the start, and the unstable ones of the other at the
+        end.
         """
         count, s, f, k = len(h), len(self.c), len(self.free), right.shape[2]
         K = np.tile(np.kron(self.derivative, np.eye(f)), (count, 1, 1)).reshape(count, s, f, s, f)

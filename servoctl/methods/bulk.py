@@ -30,20 +30,11 @@ class Steps:
     """Steps with dense output: states `at(k, times)` (n_x, N) within steps k (N,) at times (N,).
 
     `slope(k, times)` gives their derivatives, NaN for entries that are not integrated.
-
-    Attributes
-    ----------
-    t : (S + 1,) array
-        Starts, and the end of the last one [s].
-    x : (n_x, S + 1) array
-        States there.
-    failed : bool
-        Whether no further step succeeds.
     """
 
-    t: np.ndarray
-    x: np.ndarray
-    failed: bool
+    t: np.ndarray  # (S + 1,) starts, and the end of the last one [s]
+    x: np.ndarray  # (n_x, S + 1) states there
+    failed: bool  # whether no further step succeeds
 
 
 class BulkSteps(Stepping):

@@ -389,25 +389,10 @@ METHODS = {str(method): method for method in _DEFAULTS}
 
 
 def as_method(value, **settings):
-    """The method that `method=` stands for.
+    """The method that `method=` stands for: itself, or the one with this short form, with its defaults.
 
-    Parameters
-    ----------
-    value : str or Method
-        A short form stands for the method with its defaults.
-    **settings
-        Replace the defaults: rtol, atol, step, order, jets; None keeps the default.
-
-    Returns
-    -------
-    Method
-
-    Raises
-    ------
-    NameUnknown
-        If the name is not one of `METHODS`.
-    SpecificationError
-        If the method does not have the setting, or its value is out of range.
+    Settings (rtol, atol, step, order, jets) replace those of the method, and None keeps them. Raises NameUnknown for a
+    name not in `METHODS`, SpecificationError for a setting that the method does not have or that is out of range.
     """
     method = value if isinstance(value, Method) else METHODS.get(value) if isinstance(value, str) else None
     if method is None:
@@ -437,18 +422,7 @@ def default_method(model, drift=None):
 
 
 def require_combination(model, method, drift):
-    """Refuse a method and a treatment of drift that do not go together, or not with this model.
-
-    Parameters
-    ----------
-    model : Model
-    method : Method
-    drift : None, Project or Poles
-
-    Raises
-    ------
-    SpecificationError
-    """
+    """Refuse a method and a treatment of drift that do not go together, or not with this model."""
     if isinstance(method, Algebraic) and not model.flat:
         raise SpecificationError(
             "method='algebraic' was given.",

@@ -9,23 +9,11 @@ DERIVATIONS = 4  # of the equations of one motion, each near a state at which an
 
 
 def first_alive(f, entries, t, x, p):
-    """Samples at which entries that were left out are not zero: the first of them, and where they are clearest.
+    """The first sample at which entries that were left out are not zero, and the one at which they are clearest.
 
-    Parameters
-    ----------
-    f : Compiled or None
-        Values of the entries and sizes of their terms; None if nothing was left out.
-    entries : callable
-        The entries (list of SX) and points (Points) for some samples, from their indices.
-    t : (N,) array
-        [s]
-    x : (n, N) array
-        What f takes there.
-    p : (n_p,) array
-
-    Returns
-    -------
-    (int, int) or None
+    f gives the values of the entries and the sizes of their terms at t (N,) [s] and what it takes there, x (n, N); f is
+    None if nothing was left out. `entries` gives the entries (list of SX) and the points (Points) of some samples from
+    their indices. Returns two such indices, or None if all are zero.
     """
     if f is None or not len(t):
         return None
@@ -40,20 +28,9 @@ def first_alive(f, entries, t, x, p):
 
 
 def alive_along(motion):
-    """The first instant of a motion at which an entry that was left out is not zero, and a state to derive again near.
+    """The first instant of a motion [s] at which an entry that was left out is not zero, and a place to derive again.
 
-    Parameters
-    ----------
-    motion : Motion
-
-    Returns
-    -------
-    t : float
-        [s]
-    place : (float, (n_z,) array)
-        An instant [s] and the jets at which there is such an entry.
-    None
-        If all are zero.
+    The place is the instant [s] at which such an entry is clearest, with its jets (n_z,). None if all are zero.
     """
     for model, t, jets in motion.by_piece():
         f = model.dropped

@@ -121,18 +121,9 @@ class Occurrence:
 
 
 class Events:
-    """The events of one motion while it is being computed.
+    """The events, by name, of a motion while it is being computed, and their occurrences `found` so far.
 
-    Parameters
-    ----------
-    events : dict of str to Event
-    model : Model
-    times : (N,) array
-        Samples, in the order of the motion [s].
-
-    Attributes
-    ----------
-    found : list of Occurrence
+    Its samples are at times (N,), in the order of the motion [s].
     """
 
     def __init__(self, events, model, times):
@@ -157,16 +148,8 @@ class Events:
     def first(self, model, t, jets, at, stops=False):
         """The first terminal event along instants t (N,) with jets (n_z, N), or None; others before it are recorded.
 
-        Parameters
-        ----------
-        model : Model
-        t : (N,) array
-            In the order of the motion, from the end of the last ones on [s].
-        jets : (n_z, N) array
-        at : callable
-            Jets (n_z,) at an instant among them.
-        stops : bool
-            Whether the motion cannot go on from the last of them: an event may be what makes it singular there.
+        Instants are in the order of the motion, from the end of the last ones on [s]; `at` gives jets (n_z,) at one of
+        them. With `stops` the motion cannot go on from the last: an event may be what makes it singular there.
         """
         self.start = t[0] if self.start is None else self.start
         if self.began[0] == t[0]:  # these steps are repeated
@@ -288,14 +271,7 @@ def _require_signal(event, model):
 
 
 def occurrences(found, names):
-    """The runs at the instants of events: {name: Run}, from occurrences by name.
-
-    Parameters
-    ----------
-    found : dict of str to list of Occurrence
-    names : callable
-        Names of the first so many jets.
-    """
+    """The runs at the instants of events, {name: Run}, from occurrences by name; `names(k)` names the first k jets."""
     runs = {}
     for name, ones in found.items():
         jets = np.array([one.jets for one in ones]).T if ones else np.zeros((0, 0))

@@ -24,31 +24,10 @@ MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by 
 class Deviations:
     """Deviations Q from a motion in the sizes of its states, which move on in C; see deviations.h.
 
-    Parameters
-    ----------
-    model : Model
-        Without switches.
-    last : int
-        Highest index of the coefficients, for which they are compiled.
-    cuts : (C,) array
-        Instants at which steps end: the first and the last one of the motion, and those between which paths are smooth
-        [s].
-    x : (n_x,) array
-        State at the first one.
-    size : (n_x,) array
-        Sizes of the states.
-    instants : (N,) array
-        From the first of the cuts on, at which the deviations Z are kept, in which those at the first one have moved on
-        [s].
-
-    Attributes
-    ----------
-    x : (n_x,) array
-        The state after the last step.
-    Q : (f, n_x) array
-        Orthonormal deviations there.
-    Z : (f, n_x, S) array
-        At the instants; S >= N is a whole number of vectors.
+    The model has no switches, and its series are compiled up to index `last`. Steps end at `cuts` [s]: the first and
+    the last instant of the motion, and those between which paths are smooth. x (n_x,) is the state at the first cut,
+    later that after the last step, and Q (f, n_x) are orthonormal deviations there. Z (f, n_x, S) are, at `instants`
+    (N,) from the first cut on [s], what the deviations at the first of them become; S ≥ N is a whole number of vectors.
     """
 
     def __init__(self, model, last, cuts, x, size, instants=()):
@@ -79,14 +58,7 @@ class Deviations:
     def by_step(self):
         """Move to the last cut; the ends of K steps [s], the deviations there and the propagators over the steps.
 
-        Returns
-        -------
-        t : (K + 1,) array
-            With the first of the cuts.
-        Q : (K + 1, n_x, f) array
-        R : (K, f, f) array
-        None
-            As `move`.
+        That is t (K + 1,) from the first cut on, Q (K + 1, n_x, f) and R (K, f, f); None where `move` is False.
         """
         (f, n_x), start = self.Q.shape, self.Q.T.copy()
         log = np.empty((MOST_ALONG, 1 + f * (n_x + f)))
@@ -115,23 +87,9 @@ class Deviations:
 def growth(Z, count, settings):
     """Whether deviations tell that the internal dynamics of a motion are not unstable; see growth.c.
 
-    Parameters
-    ----------
-    Z : (f, n_x, S) array
-        Of `Deviations`.
-    count : int
-        Number of instants.
-    settings : sequence of float
-        Those of growth.c.
-
-    Returns
-    -------
-    quiet : bool
-        False where nothing is compiled.
-    scale : (n_x,) array
-        Of the states.
-    within : (count,) array
-        ln of the largest growth between instants that are at most 0, 1, ... blocks apart.
+    Z (f, n_x, S) is that of `Deviations`, at `count` instants; `settings` are those of growth.c. Returns the answer,
+    False where nothing is compiled; the scale (n_x,) of the states; and ln of the largest growth (count,) between
+    instants that are at most 0, 1, ... blocks apart.
     """
     f, n_x, S = Z.shape
     of_vectors = n_x**2 + f * n_x * (f + 1) // 2 + (f + 1) * (n_x + 1)

@@ -13,19 +13,7 @@ SMOOTHER = "smooth the switch, such as tanh(v/v0) for sign(v)"  # the remedy
 
 
 def kink(model, t, x):
-    """The switch on which an equilibrium lies without a linearisation, in words; "" if there is none.
-
-    Parameters
-    ----------
-    model : Model
-    t : float
-        [s]
-    x : (n_x,) array
-
-    Returns
-    -------
-    str
-    """
+    """The switch on which an equilibrium lies without a linearisation, in words; "" if there is none."""
     family = switching(model)
     if family is None:
         return ""
@@ -41,17 +29,7 @@ def kink(model, t, x):
 
 
 def stays_on_kink(model, run):
-    """The switch on which a run lies from its begin to its end, without a linearisation; "" if there is none.
-
-    Parameters
-    ----------
-    model : Model
-    run : Run
-
-    Returns
-    -------
-    str
-    """
+    """The switch on which a run lies from start to end, without a linearisation, in words; "" if there is none."""
     if switching(model) is None:
         return ""
     x = run.jets[: len(model.state_names)]

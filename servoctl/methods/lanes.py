@@ -87,18 +87,11 @@ def fits(model):
 def integrate(model, last, span, cases, rtol, times, threads=None, progress=None):
     """Integrate from starts x0 (N, n_x) with parameters p (N, n_p) and absolute tolerances (N,) over a span.
 
-    Ctrl-C ends it; `progress` is called with the number of cases begun.
-
-    Returns
-    -------
-    ends : (N, 4 + 2 n_x) array
-        Outcome (1: finished, 0: not reached before Ctrl-C, else to be computed by itself), number of steps, last
-        instant, largest violation of the invariants at start and end, relative to their gradients times the state; the
-        last state, and largest sizes of the state.
-    samples : (N, K, n_x) array
-        States at the times (K,), in the order of the motion.
-    interrupted : bool
-    The arrays are None without a compiler.
+    Ctrl-C ends it. Returns ends (N, 4 + 2 n_x), samples (N, K, n_x) at the times (K,), and whether Ctrl-C came; the
+    arrays are None without a compiler or beyond `TAYLOR_COMPILED` operations. An end has the outcome (1: finished, 0:
+    not reached before Ctrl-C, else to be computed by itself), number of steps, last instant, largest violation of the
+    invariants at start and end (relative to their gradients times the state), last state, and largest sizes of the
+    state. `progress` is called with the number of cases begun.
     """
     f = series_loop(model, last)
     library = None if f.operations > TAYLOR_COMPILED else _library(f, model)

@@ -51,24 +51,13 @@ class Singular:
 
 @frozen
 class Repivot:
-    """After `steps` whole steps the motion goes on from t [s], X = x with other pivots.
-
-    Attributes
-    ----------
-    steps : int
-    t : float
-    x : (n_x,) array
-    variant : (Model, Monitor) or None
-        With other pivots; None if they are still to be chosen.
-    otherwise : Singular
-        The outcome if no other pivots lead on.
-    """
+    """After `steps` whole steps the motion goes on from t [s], X = x with other pivots."""
 
     steps: int
     t: float
     x: np.ndarray
-    variant: tuple | None
-    otherwise: Singular
+    variant: tuple | None  # (Model, Monitor) with other pivots; None if they are still to be chosen
+    otherwise: Singular  # the outcome if no other pivots lead on
 
 
 def _other_pivots(steps, t, x):
@@ -78,27 +67,13 @@ def _other_pivots(steps, t, x):
 
 @frozen
 class Stretch:
-    """Steps of a method without dense output: between their ends states and pivots are interpolated linearly.
+    """Steps of a method without dense output: between their ends states and pivots are interpolated linearly."""
 
-    Attributes
-    ----------
-    t : (S + 1,) array
-        Ends of the steps [s].
-    x : (n_x, S + 1) array
-        States there.
-    pivots : (n_g, S, m) array
-        At m instants of each step, the last of them its end.
-    top : callable
-        γ^(s̄) from (t, X).
-    crosses : bool
-        Whether a step across a zero of a pivot is as accurate as any other, so that the motion goes on from its end.
-    """
-
-    t: np.ndarray
-    x: np.ndarray
-    pivots: np.ndarray
-    top: object
-    crosses: bool = False
+    t: np.ndarray  # (S + 1,) ends of the steps [s]
+    x: np.ndarray  # (n_x, S + 1) states there
+    pivots: np.ndarray  # (n_g, S, m) at m instants of each step, the last of them its end
+    top: object  # γ^(s̄) from (t, X)
+    crosses: bool = False  # steps across a pivot's zero are as accurate as others: the motion goes on from their end
     lost = LOST  # rank measure at a zero as roughly located as here, below which the program is singular
 
     def first(self, count):
@@ -137,24 +112,12 @@ class Stretch:
 
 @frozen
 class DenseStretch(Stretch):
-    """Steps of a method with dense output.
+    """Steps of a method with dense output."""
 
-    Attributes
-    ----------
-    dense : callable
-        States (n_x, N) from steps k (N,) and times (N,).
-    pivots_at : callable
-        Pivots from (t, X).
-    slope : callable or None
-        Its derivatives, from steps and times as well; NaN for entries that the method does not integrate.
-    resumes : bool
-        Whether the dense output is as accurate as the steps, so that the motion may go on from within a step.
-    """
-
-    dense: object = None
-    pivots_at: object = None
-    slope: object = None
-    resumes: bool = False
+    dense: object = None  # states (n_x, N) from steps k (N,) and times (N,)
+    pivots_at: object = None  # pivots from (t, X)
+    slope: object = None  # derivatives of the states, as `dense`; NaN for entries that are not integrated
+    resumes: bool = False  # whether dense output is as accurate as the steps, so that the motion may go on within one
     lost = SINGULAR
 
     def instants(self, k):
@@ -219,17 +182,10 @@ def strong(pivots, usual):
 
 
 class Monitor:
-    """Pivots and matrices of a model along a motion.
+    """Pivots and matrices of a model along a motion; x at t is the state of the first references, which grow along it.
 
-    Parameters
-    ----------
-    model : Model
-    t : float
-    x : (n_x,) array
-        State of the first references, which grow along the motion.
-    before : Monitor, optional
-        Monitor of the variant that this one replaces. Its references stay valid for columns and for rows that both
-        variants have, so that a gradient that has nearly vanished does not become its own reference.
+    `before` is the monitor of the variant that this one replaces. Its references stay valid for columns and for rows
+    that both variants have, so that a gradient that has nearly vanished does not become its own reference.
     """
 
     def __init__(self, model, t, x, before=None):
@@ -356,16 +312,7 @@ class Monitor:
         return pivots / np.where(largest > 0, largest, 1.0), largest
 
     def inspect(self, stretch):
-        """Inspect the pivots along steps that continue the inspected ones.
-
-        Parameters
-        ----------
-        stretch : Stretch
-
-        Returns
-        -------
-        Fine, Repivot or Singular
-        """
+        """Inspect the pivots along steps that continue the inspected ones: Fine, Repivot or Singular."""
         n_g, count, m = stretch.pivots.shape
         if not stretch.pivots.size or self._all_strong(stretch.pivots.reshape(n_g, -1)):
             return Fine(count)

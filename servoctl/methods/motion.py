@@ -27,15 +27,12 @@ ADVICE = "Use a smaller rtol, another method or drift='project', or check whethe
 class Motion:
     """A motion while it is being computed: samples of the state, and the model variant that holds in each piece.
 
-    Attributes
-    ----------
-    pieces : list of (model, first, start, end)
-        The samples from `start` to `end` belong to a variant of the model; its steps begin at the sample `first`, which
-        is `start` or the one before, as an instant that two pieces share is one sample.
+    The samples from `start` to `end` of a piece belong to its model; its steps begin at the sample `first`, which is
+    `start` or the one before, as an instant that two pieces share is one sample.
     """
 
     counters: dict = field(default_factory=dict)
-    pieces: list = field(default_factory=list)
+    pieces: list = field(default_factory=list)  # (model, first, start, end)
     stop: object = None
     interrupted: bool = False
     ended: str = ""  # by this terminal event
@@ -232,13 +229,6 @@ class Stepping:
     A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the instant and the state at its
     end, which lies before b where a switching function vanishes. If a step fails, `rank_lost` describes this for a
     singular program, and `advice` is for other failures.
-
-    Parameters
-    ----------
-    model : Model
-    method : str
-    drift : None, Poles or Project
-    progress : callable
     """
 
     rank_lost = "the step of the integrator shrinks to nothing"
@@ -267,22 +257,7 @@ class Stepping:
         return model.function("ode_poles" if poles else "ode")
 
     def run(self, t0, x0, t1, t_eval, knots):
-        """Integrate from t0 to t1 [s].
-
-        Parameters
-        ----------
-        t0 : float
-        x0 : (n_x,) array
-        t1 : float
-        t_eval : (N,) array
-            Instants of the samples, in the order of the motion [s].
-        knots : sequence of float
-            At which steps end [s].
-
-        Returns
-        -------
-        Motion
-        """
+        """Integrate from x0 (n_x,) at t0 to t1 [s], with samples at t_eval, in this order; steps end at the knots."""
         with interruptible(self.motion):
             self.span = t0, t1
             self._watch(t0, x0, t1)

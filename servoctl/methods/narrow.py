@@ -54,22 +54,8 @@ def _moves(argument, known, q):
 def centres(f, p, t, x, dense):
     """Instants at which an argument is zero, or its magnitude least, and those beside at which it differs by 0.7.
 
-    Parameters
-    ----------
-    f : Compiled
-        From `arguments`.
-    p : (n_p,) array
-    t : (N,) array
-        Instants in the order of the motion [s].
-    x : (n_x, N) array
-        States there.
-    dense : callable
-        States (n_x, M) at times (M,) between the first and the last instant.
-
-    Returns
-    -------
-    (M,) array
-        Not in order.
+    f is from `arguments`. States x (n_x, N) are those at t (N,), in the order of the motion [s]; `dense` gives states
+    (n_x, M) at times (M,) between the first and the last of these instants. The result (M,) is not in order.
     """
     with np.errstate(all="ignore"):
         g = f.grid(t, x, p)

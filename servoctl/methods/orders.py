@@ -5,13 +5,7 @@ from servoctl.reduction.orders import other_order
 
 
 def end_at_other_orders(motion):
-    """Cut a motion before the first sample at which a row has another order, and set the error as its stop.
-
-    Parameters
-    ----------
-    motion : Motion
-        Its samples are cut in place.
-    """
+    """Cut a motion in place before the first sample at which a row has another order, and set the error as its stop."""
     for model, t, jets in motion.by_piece():
         k, name = model.reduction.orders.first_change(t, jets, model.parameters)
         if k is not None:

@@ -23,24 +23,12 @@ STAGES = {5: 3, 9: 5, 13: 7}  # all L-stable; for an odd number of stages A has 
 
 @functools.cache
 def radau(order):
-    """The Radau IIA method of an order (Hairer and Wanner 1996, IV.5 and IV.8).
+    """The Radau IIA method of order 5, 9 or 13: c, A⁻¹, T, T⁻¹, μ and e (Hairer and Wanner 1996, IV.5 and IV.8).
 
-    Parameters
-    ----------
-    order : {5, 9, 13}
-
-    Returns
-    -------
-    c : (s,) array
-        Nodes, the last of which is 1.
-    rate : (s, s) array
-        A⁻¹, which maps increments of the stages to h times their rates (the collocation polynomial's derivative).
-    from_pairs, to_pairs : (s, s) arrays
-        Real and imaginary parts of the eigenvectors of A⁻¹ as columns, and their inverse.
-    mu : ((s + 1)/2, 2) array
-        Eigenvalues of A⁻¹, real and imaginary parts: the real one, then one of each pair.
-    e : (s,) array
-        Weights of the increments in the error of the embedded method of order s.
+    c (s,) are the nodes, the last of which is 1. A⁻¹ (s, s) maps increments of the stages to h times their rates (the
+    collocation polynomial's derivative). T (s, s) has the real and imaginary parts of its eigenvectors as columns, and
+    μ ((s + 1)/2, 2) those of its eigenvalues as rows: the real one, then one of each pair. e (s,) are the weights of
+    the increments in the error of the embedded method of order s.
     """
     from scipy.special import roots_jacobi
 
@@ -95,24 +83,13 @@ def radau_loop(model, poles=False):
 
 @frozen
 class Settings:
-    """How Radau IIA steps are taken.
+    """How Radau IIA steps are taken."""
 
-    Attributes
-    ----------
-    order : {5, 9, 13}
-    rtol, atol : float
-        Tolerance of each entry of the state, relative and absolute, of the embedded method of order s.
-    fixed : bool
-        Whether all steps have the length of the first.
-    project_every : int
-        Steps between projections; 0 for none.
-    """
-
-    order: int
-    rtol: float
-    atol: float
-    fixed: bool = False
-    project_every: int = 0
+    order: int  # 5, 9 or 13
+    rtol: float  # of each entry of the state, for the error of the embedded method of order s
+    atol: float  # the same
+    fixed: bool = False  # whether all steps have the length of the first
+    project_every: int = 0  # steps between projections; 0 for none
 
     @property
     def iterations(self):
@@ -126,35 +103,11 @@ class Settings:
 
 
 def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
-    """Radau IIA steps towards t1.
+    """Radau IIA steps from x0 (n_x,) at t0 towards t1 [s], the first of length h > 0 [s]; f is from `radau_loop`.
 
-    Parameters
-    ----------
-    f : Compiled
-        From `radau_loop`.
-    t0, t1 : float
-        [s]
-    x0 : (n_x,) array
-        State at t0, SI.
-    p : (n_p,) array
-        Parameters, SI.
-    h : float
-        Length of the first step [s], positive.
-    settings : Settings
-    max_steps : int
-
-    Returns
-    -------
-    t : (S + 1,) array
-        Starts of the steps and the end of the last [s], which lies before t1 if steps vanish.
-    x : (n_x, S + 1) array
-        States there, SI.
-    z : (S, s, n_x) array
-        Increments of the stages.
-    h : float
-        Length that the next step should have [s].
-    counts : (4,) array
-        Rejected steps, evaluations of X', of the Jacobian, decompositions.
+    Returns t (S + 1,), starts of steps and the end of the last [s], which lies before t1 if steps vanish or `max_steps`
+    do not suffice; states (n_x, S + 1) there; increments (S, s, n_x) of the stages; the length that the next step
+    should have [s]; and counts (4,) of rejected steps, evaluations of X', of the Jacobian, and decompositions.
     """
     parts, n = radau(settings.order), len(x0)
     s, table = len(parts[0]), np.concatenate([np.ravel(part) for part in parts])
@@ -212,17 +165,10 @@ def _size(v):
 
 @frozen
 class Collocated(Steps):
-    """Steps of a Radau IIA method.
-
-    Attributes
-    ----------
-    order : int
-    z : (S, s, n_x) array
-        Increments of the stages.
-    """
+    """Steps of a Radau IIA method."""
 
     order: int
-    z: np.ndarray
+    z: np.ndarray  # (S, s, n_x) increments of the stages
 
     def at(self, k, times):
         """States (n_x, N) at times (N,) within steps k (N,), by the collocation polynomials."""
@@ -243,23 +189,9 @@ class Collocated(Steps):
 
 
 class RadauSteps(BulkSteps):
-    """One integration by a Radau IIA method.
+    """One integration by a Radau IIA method, which is refused where there is no C compiler.
 
-    Parameters
-    ----------
-    model : Model
-    drift : None, Poles or Project
-    rtol, atol : float
-    order : {5, 9, 13} or None
-        None chooses it by `radau_order`.
-    step : float or None
-        Length of fixed steps [s]; None adapts them.
-    progress : callable
-
-    Raises
-    ------
-    SpecificationError
-        Where there is no C compiler.
+    The order is 5, 9 or 13; None leaves it to `radau_order`. `step` is the length of fixed steps [s]; None adapts them.
     """
 
     most = 200  # steps per call of the compiled loop

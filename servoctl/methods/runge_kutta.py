@@ -23,18 +23,7 @@ def tableau(name):
 
 
 class RungeKuttaSteps(Stepping):
-    """One integration with steps of at most `step` that end at the knots; every step is a sample.
-
-    Parameters
-    ----------
-    model : Model
-    method : str
-        One of `ORDERS`.
-    drift : None, Poles or Project
-    step : float
-        [s]
-    progress : callable
-    """
+    """One integration, by one of `ORDERS`, in steps of at most `step` [s] that end at knots; every step is a sample."""
 
     rank_lost = "the state is no longer finite"
     advice = "Use a smaller step (stable below about 2.8 over the largest eigenvalue), slower poles, or 'DOP853'."

@@ -14,15 +14,9 @@ MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain pa
 
 @frozen
 class Solved(Steps):
-    """Steps of a solver.
+    """Steps of a solver."""
 
-    Attributes
-    ----------
-    dense : list of callable
-        States (n_x, N) at times (N,) within each step.
-    """
-
-    dense: list
+    dense: list  # for each step: states (n_x, N) from times (N,) within it
 
     def at(self, k, times):
         """States (n_x, N) at times (N,) within steps k (N,)."""
@@ -38,18 +32,9 @@ class Solved(Steps):
 
 
 class ScipySteps(BulkSteps):
-    """One integration by one of scipy's methods.
+    """One integration by one of scipy's methods, `choice.SCIPY`.
 
-    Parameters
-    ----------
-    model : Model
-    method : str
-        One of `choice.SCIPY`.
-    drift : None, Poles or Project
-    rtol, atol : float
-    progress : callable
-    for_stiff : Method, optional
-        To which the motion is left where stability limits the steps.
+    Where stability limits the steps, the motion is left to the method `for_stiff`, if there is one.
     """
 
     advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."

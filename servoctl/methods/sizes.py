@@ -22,14 +22,7 @@ def motion_sizes(model, t, x):
 
     A level is as large as its largest √M_ii |γ_i^(k)|, and at least as large as the level below over the time; what a
     coordinate at rest has of it is rounding. Coordinates without inertia, and q of another frame than γ', have their
-    own largest magnitude.
-
-    Parameters
-    ----------
-    model : Model
-    t : (N,) array
-        [s]
-    x : (n_x, N) array
+    own largest magnitude. The motion is x (n_x, N) at t (N,) [s].
     """
     inertia = model.function("matrices")(t[0], x[:, 0], model.parameters)[-model.n :]
     return sizes_of(model, inertia, np.abs(x).max(axis=1), t[-1] - t[0])

@@ -24,27 +24,12 @@ UNRESOLVED = 0.1  # of the state's size: a larger difference of a step and two h
 
 
 def stability_function(method, order=None):
-    """The factor R(z), z = hλ, by which one step multiplies a solution of x' = λx.
+    """Numerator and denominator of R(z), z = hλ, the factor by which one step multiplies a solution of x' = λx.
 
-    Parameters
-    ----------
-    method : str
-        One of `STEP_MAPS`.
-    order : int, optional
-        Required by "Taylor" and "RadauIIA" (2s - 1 for s stages), not used by other methods.
-
-    Returns
-    -------
-    numerator, denominator : (k,) arrays
-        Coefficients by ascending powers of z. For an explicit tableau R = 1 + Σ bᵀAᵏ⁻¹1 zᵏ; for a series of order p
-        the first p + 1 terms of eᶻ; for Radau IIA of s stages its Padé fraction (s - 1, s). "Radau" has three stages.
-
-    Raises
-    ------
-    NameUnknown
-        For a method without a step map, such as a multistep method.
-    SpecificationError
-        If the order is missing, not available, or not used by the method.
+    Coefficients (k,) ascend in powers of z: R = 1 + Σ bᵀAᵏ⁻¹1 zᵏ for an explicit tableau, the first p + 1 terms of eᶻ
+    for a series of order p, and its Padé fraction (s - 1, s) for Radau IIA of s stages; "Radau" has three. "Taylor"
+    needs an order, "RadauIIA" an odd one (2s - 1), and for other methods an order is refused. NameUnknown is raised for
+    a method without a step map, such as a multistep one.
     """
     named(method, STEP_MAPS, "method")
     whole = is_whole(order) and 1 <= order <= MOST_JETS and (method == "Taylor" or order % 2 == 1)
@@ -79,22 +64,7 @@ def _pade(k, m):
 
 
 def amplification(method, z, order=None):
-    """|R(z)|, the factor by which one step multiplies a mode.
-
-    Parameters
-    ----------
-    method : str
-        One of `STEP_MAPS`.
-    z : array of complex
-        Steps times eigenvalues, hλ.
-    order : int, optional
-        Order of "Taylor" or "RadauIIA".
-
-    Returns
-    -------
-    array
-        Same shape as z.
-    """
+    """|R(z)|, the factor by which one step multiplies a mode, for an array z = hλ; see `stability_function`."""
     above, below = stability_function(method, order)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.abs(np.polyval(above[::-1], z) / np.polyval(below[::-1], z))
@@ -102,25 +72,10 @@ def amplification(method, z, order=None):
 
 @cache
 def largest_explicit(method, order=None, direction=pi):
-    """The largest |hλ| up to which a method damps a mode in one direction of the complex plane.
+    """The largest |hλ| up to which a method damps a mode with arg λ = direction [rad]; inf if no step amplifies it.
 
-    Parameters
-    ----------
-    method : str
-        One of `STEP_MAPS`.
-    order : int, optional
-        Order of "Taylor" or "RadauIIA".
-    direction : float
-        arg λ [rad]; default π, the negative real axis: 2.785, 3.307 for RK4, RK45.
-
-    Returns
-    -------
-    float
-        inf if no step amplifies the mode; 0 if every step does.
-
-    Notes
-    -----
-    |R(re^{iφ})|² = 1 is a polynomial equation in r; the least positive root beyond which |R| exceeds 1 is returned.
+    |R(re^{iφ})|² = 1 is a polynomial equation in r; the least positive root beyond which |R| exceeds 1 is returned, or
+    0 if even the shortest steps amplify the mode. On the negative real axis it is 2.785 for RK4 and 3.307 for RK45.
     """
     above, below = (c * np.exp(1j * direction * np.arange(len(c))) for c in stability_function(method, order))
     square = [np.convolve(c, c.conj()).real for c in (above, below)]
@@ -248,20 +203,12 @@ def warn_drifted(name, residual, t, method):
 
 
 def unresolved(pieces, halved):
-    """The last step of a motion, or else the one of the fastest change, if two half steps lead elsewhere.
+    """The last step of a motion, or else the one of the fastest change, if two half steps lead elsewhere; else None.
 
-    Parameters
-    ----------
-    pieces : list of (model, t, states)
-        Steps from t[k] to t[k + 1] [s] with states (n_x, N) by one variant of the model.
-    halved : callable
-        (model, t, x, h) -> states (n_x, 3) at t, t + h and t + 2 h; fewer if a step fails.
-
-    Returns
-    -------
-    ((start, end), x, difference, size) or None
-        Start and end of the step [s], the state (n_x,) at its start, the difference of both ends relative to the sizes
-        of the state's entries (n_x,), and these sizes.
+    Pieces are (model, t, states), with steps from t[k] to t[k + 1] [s] and states (n_x, N); `halved`(model, t, x, h)
+    gives states (n_x, 3) at t, t + h and t + 2 h, fewer if a step fails. Returns the start and end of the step [s], the
+    state at its start, the difference of both ends (n_x,) relative to the sizes of the state's entries, infinite if a
+    half step fails, and these sizes (n_x,).
     """
     pieces = [piece for piece in pieces if len(piece[1]) > 1]
     if not pieces:

@@ -225,19 +225,10 @@ class _Reacting(_Motion):
 
 
 def taylor_coefficients(equations, last):
-    """Normalised Taylor coefficients of q and γ with index 1 .. last at a state.
+    """Normalised Taylor coefficients of q and γ with index 1 .. last ≥ s̄ + 1 at a state, as a function of (t, X, p).
 
-    Parameters
-    ----------
-    equations : Equations
-    last : int
-        At least s̄ + 1.
-
-    Returns
-    -------
-    casadi.Function
-        Arguments t, X, p, where p ends with the instant that selects the branches of paths. Outputs q_[1], ...,
-        q_[last] (left out if q' = γ'), γ_[1], ..., γ_[last], pivots.
+    p ends with the instant that selects the branches of paths. Outputs are q_[1], ..., q_[last] (if q' ≠ γ'), γ_[1],
+    ..., γ_[last], and pivots.
     """
     r = equations.r
     if r.cascade is not None:
@@ -308,14 +299,6 @@ def settled(equations):
     """The state with the velocities that rows determine, and γ^(s̄), as a function of (t, X, p).
 
     Near the end of a step the series of these velocities errs more than what is integrated, its derivatives even more.
-
-    Parameters
-    ----------
-    equations : Equations
-
-    Returns
-    -------
-    casadi.Function
     """
     rows = _by_rows(equations, equations.top)
     gamma = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top + 1) for c in rows.motion.gamma[k]]
@@ -323,18 +306,7 @@ def settled(equations):
 
 
 def series_loop(model, last):
-    """The compiled Taylor coefficients of a model with index up to `last`, with their loop.
-
-    Parameters
-    ----------
-    model : Model
-    last : int
-        Highest index κ of the coefficients γ_[κ].
-
-    Returns
-    -------
-    Compiled
-    """
+    """The compiled Taylor coefficients of a model, up to γ_[last], with their loop."""
 
     def build():
         e, q = model.equations, model.reduction.mechanism.q
@@ -403,16 +375,9 @@ def leave_if_stiff(steps, method, limit, t, x):
 
 
 class TaylorSteps(Stepping):
-    """One integration by the Taylor method.
+    """One integration by the Taylor method, whose absolute tolerance is `atol`, not that of `method`.
 
-    Parameters
-    ----------
-    model : Model
-    drift : None or Project
-    method : Taylor
-    atol : float or (n_x,) array
-        Its absolute tolerance; entries of a level are compared in their own ones.
-    progress : callable
+    With atol (n_x,) in place of a number, entries of a level are compared in their own tolerances.
     """
 
     most = 100  # steps per call of the compiled loop

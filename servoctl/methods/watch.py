@@ -41,30 +41,15 @@ END_BEFORE = "Let the motion end before, or write the residual so that it is smo
 
 @frozen
 class End:
-    """The smooth piece ends at t [s], X = x, in the step after `steps` whole ones.
-
-    Attributes
-    ----------
-    steps : int
-    t : float
-    x : (n_x,) array
-    switched : tuple of int
-        The switches that the motion crosses there; none where it stops.
-    branches : tuple of float
-        All branches beyond.
-    error : ServoError or None
-        Why it stops.
-    event : str
-        The terminal event that ends the motion there.
-    """
+    """The smooth piece ends at t [s], X = x, in the step after `steps` whole ones."""
 
     steps: int
     t: float
     x: np.ndarray
-    switched: tuple = ()
-    branches: tuple = ()
-    error: object = None
-    event: str = ""
+    switched: tuple = ()  # indices of the switches that the motion crosses there; none where it stops
+    branches: tuple = ()  # all branches beyond
+    error: object = None  # why it stops: a ServoError or None
+    event: str = ""  # the terminal event that ends the motion there
 
 
 def steps_of(t, times):
@@ -76,14 +61,8 @@ def steps_of(t, times):
 def net(t, distance, least):
     """Instants within steps with ends t (S + 1,), in at least so many equal parts, no longer than a distance [s].
 
-    Returns
-    -------
-    k : (N,) array of int
-        Their steps.
-    at : (N,) array
-        In the order of the motion, ends of steps included [s].
-    common : (N,) array of bool
-        Ends of the least parts, which all steps have.
+    Returns their steps (N,); the instants (N,) in the order of the motion, ends of steps included [s]; and whether they
+    are ends of the least parts, which all steps have, (N,).
     """
     h = np.diff(t)
     parts = least * np.maximum(np.ceil(np.abs(h) / (least * distance)), 1).astype(int)
@@ -100,14 +79,7 @@ def resolved(rtol, atol):
 
 
 class Tolerance:
-    """The tolerances of the state along a motion, and of functions of it.
-
-    Parameters
-    ----------
-    model : Model
-    rtol : float
-    atol : float or (n_x,) array
-    """
+    """The tolerances of the state along a motion, and of functions of it; atol is a number or an array (n_x,)."""
 
     def __init__(self, model, rtol, atol):
         self.rtol, atol = resolved(rtol, atol)
@@ -135,23 +107,9 @@ class Tolerance:
 
 
 class Switches:
-    """The switching functions of a motion.
+    """The switching functions of a motion of length `span` [s], evaluated at the ends of so many parts of each step.
 
-    Parameters
-    ----------
-    family : Switching
-    span : float
-        Length of the whole motion [s].
-    parts : int
-        Parts of a step at whose ends the functions are evaluated.
-
-    Attributes
-    ----------
-    branches : tuple of float
-        Those that hold.
-    tolerance : Tolerance
-    start : float
-        Of the piece [s].
+    A `Watch` sets the branches that hold, the tolerance, and the start of the piece [s].
     """
 
     def __init__(self, family, span, parts):
@@ -269,15 +227,7 @@ class Switches:
 
 
 class Residuals:
-    """The residuals of a motion at all levels of its state.
-
-    Parameters
-    ----------
-    model : Model
-    tolerance : Tolerance
-    coefficients : sequence of array
-        Coefficients of the error dynamics of each row, empty without them.
-    """
+    """The residuals of a motion at all levels of its state; `coefficients` are those of each row's error dynamics."""
 
     def __init__(self, model, tolerance, coefficients=()):
         self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
@@ -343,12 +293,7 @@ class Residuals:
     def off(self, t, before, after):
         """How far residuals (m, N) exceed what they may be at the ends of steps, negative where all is well.
 
-        Parameters
-        ----------
-        t : (2, N) array
-            Starts and ends of the steps [s].
-        before, after : (n_x, N) arrays
-            States there.
+        The starts and ends of the steps are t (2, N) [s], and the states there `before` and `after` (n_x, N).
         """
         with np.errstate(all="ignore"):
             values, _ = self.values(t[0], before)
@@ -402,18 +347,9 @@ def edge(model, t, x):
 class Watch:
     """Finds where a smooth piece of a motion ends.
 
-    Parameters
-    ----------
-    tolerances : (rtol, atol) or None
-        Of the method; None for steps of fixed length.
-    span : float
-        Length of the whole motion [s].
-    family : Switching or None
-        The smooth models of a model with kinks or switches.
-    exact : bool
-        Whether the residuals are solved for, so that they need no watch.
-    parts : int
-        Parts of a step at whose ends switching functions are evaluated.
+    The tolerances (rtol, atol) are those of the method, None for steps of fixed length; `span` is the length of the
+    whole motion [s], and `family` has the smooth models of one with kinks or switches. Residuals that are solved for,
+    `exact`, need no watch. Switching functions are evaluated at the ends of so many parts of each step.
     """
 
     def __init__(self, tolerances, span, family, exact, parts):
@@ -454,15 +390,8 @@ class Watch:
     def left(self, stretch, state, again=None, projected=False):
         """Where a residual leaves its tolerance within steps, as an `End`, or None.
 
-        Parameters
-        ----------
-        stretch : Stretch
-        state : callable
-            X from (k, t).
-        again : callable, optional
-            States at the ends of equal steps, from (t, x, h, count); for steps of fixed length.
-        projected : bool
-            Whether the ends of steps were projected: what `state` gives there was not.
+        `state` gives X from (k, t); `again`, for steps of fixed length, gives states at the ends of equal steps from
+        (t, x, h, count). Where the ends of steps were `projected`, what `state` gives there was not.
         """
         count = len(stretch.t) - 1
         if not count:
@@ -497,14 +426,8 @@ class Watch:
     def torn(self, t, x, rates, finer):
         """Where states that are solved for, or projected, jump although their rates do not, as an `End`, or None.
 
-        Parameters
-        ----------
-        t : (S + 1,) array
-            [s]
-        x, rates : (n_x, S + 1) arrays
-            States, and X' there.
-        finer : callable
-            The same (t, x, rates) at more instants from (t0, x0, t1).
+        States x and their rates X' are (n_x, S + 1), at t (S + 1,) [s]; `finer` gives the same (t, x, rates) at more
+        instants from (t0, x0, t1).
         """
         beyond = self._beyond_rates(t, x, rates)
         for k in np.flatnonzero((beyond > self.rough[:, None]).any(axis=0)):

@@ -17,16 +17,7 @@ from servoctl.spec.coordinates import jet_name
 class Invariants:
     """Invariants of the state X = (q, γ', ..., γ^(s̄-1)): the rows and those of their derivatives without γ^(s̄).
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-    rows : sequence of Row
-    top : int
-        s̄.
-    points : Points
-        Points of the manifold of the rows, at which pivots are chosen.
-    cascade : Cascade, optional
-        The rows by blocks.
+    `top` is s̄. Pivots are chosen at `points` of the manifold of the rows; a `cascade` has the rows by blocks.
     """
 
     def __init__(self, mechanism, rows, top, points, cascade=None):
@@ -110,12 +101,7 @@ class Invariants:
 
 
 class Equations(Invariants):
-    """Expressions of a reduction, in the state X and the jets Z = (X, γ^(s̄)).
-
-    Parameters
-    ----------
-    reduction : Reduction
-    """
+    """Expressions of a reduction, in the state X and the jets Z = (X, γ^(s̄))."""
 
     def __init__(self, reduction):
         super().__init__(reduction.mechanism, reduction.rows, reduction.top, reduction.points, reduction.cascade)

@@ -30,21 +30,11 @@ EQUAL = 1e-9  # difference of values at two instants that is rounding, at veloci
 
 @frozen
 class Standstill:
-    """What is open while a machine stands still.
+    """What is open while a machine stands still."""
 
-    Attributes
-    ----------
-    coordinates : tuple of str
-        Those that the constraints determine in motion only.
-    rows : tuple of str
-        These constraints.
-    rates : tuple of str
-        Velocities in the constraints that these do not determine: with one of them the machine may start in motion.
-    """
-
-    coordinates: tuple
-    rows: tuple
-    rates: tuple = ()
+    coordinates: tuple  # names of those that the constraints determine in motion only
+    rows: tuple  # names of these constraints
+    rates: tuple = ()  # velocities in them that they do not determine: with one the machine may start in motion
 
     def error(self, t, nearest=None, values=None, **facts):
         """The error of a program that is singular because its machine stands still at t [s].
@@ -256,13 +246,7 @@ def standstill_near(model, t, chosen):
 
 
 def _limit(model, t, held, chosen, still):
-    """The start that the motion after t has as its limit.
-
-    Raises
-    ------
-    SingularProgram
-        If there is no motion after t, or it has no limit.
-    """
+    """The start that the motion after t has as its limit; raises SingularProgram if there is no motion, or no limit."""
     moving = first_motion(model, t, chosen, still)
     if moving is None:
         raise still.error(t)

@@ -70,10 +70,7 @@ def _work(rows):
 def accelerations(equations):
     """Outputs (γ'', μ) at a state: by (3.18) or by the sparse elimination, whichever takes fewer operations.
 
-    Raises
-    ------
-    SpecificationError
-        If the motion needs a derivative of the balance, or its order is above 2.
+    Raises SpecificationError if the motion needs a derivative of the balance, or if its order is above 2.
     """
     r, q = equations.r, equations.q
     if not applies(r):

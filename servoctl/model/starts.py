@@ -13,17 +13,10 @@ PASSES = 2  # Newton steps of each level: one solves it, another one takes what 
 
 
 def linear_levels(model, held):
-    """Rows of the invariants and unknown entries of the state of each level; None if they are no linear problem.
+    """Indices of the invariants and of the unknown entries of the state by level; None if they are no linear problem.
 
-    Parameters
-    ----------
-    model : Model
-    held : sequence of str
-        Names of the held values.
-
-    Returns
-    -------
-    list of (list of int, list of int)
+    A linear problem has as many names in `held` as free initial values, and invariants that are affine in the unknown
+    entries, as many as these. Levels without invariants are left out.
     """
     names = model.state_names
     if not set(held) <= set(names) or len(set(held)) != model.free or model.reduction.cascade is not None:
@@ -53,13 +46,10 @@ def same_start(model, held, parameters):
 
 
 def linear_starts(model, t, held, p):
-    """States (N, n_x) at time t with held values, a dict of str to (N,) array, for parameters p (N, n_p).
+    """States (N, n_x) at time t [s] with held values, and whether each is the only one with these values, (N,).
 
-    Returns
-    -------
-    states : (N, n_x) array
-    solved : (N,) array of bool
-        Where they are the only ones with these values.
+    `held` is a dict of str to (N,) array, the parameters p are (N, n_p). A state that is not the only one means
+    nothing.
     """
     states, solved = np.zeros((len(p), len(model.state_names))), np.zeros(len(p), bool)
     levels = model.once(f"linear levels {sorted(held)}", lambda: linear_levels(model, tuple(held)))

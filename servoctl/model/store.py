@@ -40,17 +40,8 @@ _LOADED = time.time()
 class Store:
     """The derivations of one specification on disk.
 
-    Parameters
-    ----------
-    mechanism, program, guess, near, values
-        The arguments of `servoctl.reduction.reduce.reduce`.
-
-    Attributes
-    ----------
-    specification : tuple
-        These arguments.
-    fingerprint : str or None
-        See `fingerprint`.
+    `specification` holds the arguments, which are those of `servoctl.reduction.reduce.reduce`, and `fingerprint` their
+    hash; where that is None, nothing is read or written.
     """
 
     def __init__(self, mechanism, program, guess=None, near=None, values=None):
@@ -66,10 +57,7 @@ class Store:
     def recall(self, name, build):
         """The entry of this name; if there is none, the value of `build()`, which is written.
 
-        Raises
-        ------
-        SpecificationError
-            If the value must be built after the specification was changed.
+        Raises SpecificationError if the value must be built after the specification was changed.
         """
         path = self._path(name)
         entry = _read(path)
@@ -125,15 +113,8 @@ def unpack(content, mechanism, **shared):
 def fingerprint(mechanism, program, guess=None, near=None, values=None):
     """Hash of all that a derivation depends on: operations in their order, names, numbers and choices.
 
-    Parameters
-    ----------
-    mechanism, program, guess, near, values
-        The arguments of `servoctl.reduction.reduce.reduce`.
-
-    Returns
-    -------
-    str or None
-        None if the specification cannot be hashed: instances of subclasses may hold more than their expressions.
+    The arguments are those of `servoctl.reduction.reduce.reduce`. None if the specification cannot be hashed, since
+    instances of subclasses may hold more than their expressions, or if its tables are too large to be stored.
     """
     if (type(mechanism), type(program)) != (Mechanism, Program):
         return None

@@ -18,11 +18,7 @@ MOST_TURNS = 16  # of a switch at one state, while those inside its switching fu
 class Switching:
     """A model as a family of smooth models, one for each choice of its branches; made by `switching`.
 
-    Attributes
-    ----------
-    model : Model
-        As it was specified.
-    switches : list of Switch
+    `model` is the one that was specified; `switches` is a list of `Switch` in the order of the branches.
     """
 
     def __init__(self, model):
@@ -55,38 +51,19 @@ class Switching:
         return compiled(ca.Function("switches", [q.t, state, ca.vertcat(*m.parameters.symbols)], [y]), "switches")
 
     def values(self, branches, t, x):
-        """Switching functions at states.
+        """Switching functions (S, N), their slopes in X (S, n_x, N), and the branches beyond their zeros (S, N).
 
-        Parameters
-        ----------
-        branches : tuple of float
-        t : (N,) array
-            [s]
-        x : (n_x, N) array
-
-        Returns
-        -------
-        functions : (S, N) array
-            Not negative where the branches are right.
-        slopes : (S, n_x, N) array
-            Their derivatives in X.
-        others : (S, N) array
-            The branches beyond their zeros.
+        At times t (N,) [s] and states x (n_x, N). The functions are not negative where the branches (tuple of float)
+        are right.
         """
         n = len(self.switches)
         y = self._function.grid(t, x, np.append(self.model.parameters, branches))
         return y[:n], y[2 * n :].reshape(len(x), n, -1).swapaxes(0, 1), y[n : 2 * n]
 
     def branches(self, t, x, known=None):
-        """The branches at a state.
+        """The branches at a state x (n_x,) at time t [s].
 
-        Parameters
-        ----------
-        t : float
-            [s]
-        x : (n_x,) array
-        known : tuple of float, optional
-            Branches nearby, which are kept where a switching function is zero.
+        `known` are branches nearby, which are kept where a switching function is zero.
         """
         result = list(known or (float(not s.angle) for s in self.switches))
         for _ in range(MOST_TURNS * len(result)):  # branches inside the switching functions of others are settled first
@@ -100,10 +77,7 @@ class Switching:
     def at(self, branches):
         """The smooth model for a choice of branches (tuple of float).
 
-        Raises
-        ------
-        ServoError
-            If the specification has no model with them, or one of another structure.
+        Raises ServoError if the specification has no model with them, or one of another structure.
         """
         if branches not in self._models:
             # half turns of an angle change no rank, so that they need no decision

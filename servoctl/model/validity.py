@@ -27,20 +27,13 @@ MOVES = 8  # Newton steps of a point to the manifold of other parameters
 class Quantities:
     """What decides whether a derivation is valid, as a function of (t, Z, p).
 
-    Attributes
-    ----------
-    function : Compiled or None
-        Values and sizes of the terms of all groups; None if these contain jets above s̄.
-    counts : dict of str to int
-        Scalars in each group: "slopes" that vanish and their "jets" and "terms", "pivots", "conditions" and "dropped"
-        entries, which vanish, and the inertia matrix, "mass", without sizes.
-    pivots : (n_pivots,) array
-        Least sizes of the pivots at the points where they were chosen.
+    The groups are "slopes" that vanish with their "jets" and "terms", "pivots", "conditions" and "dropped" entries,
+    which vanish, and the inertia matrix, "mass", which has no sizes.
     """
 
-    function: object
-    counts: dict
-    pivots: np.ndarray
+    function: object  # values and sizes of the terms of all groups; None if these contain jets above s̄
+    counts: dict  # scalars in each group, by name
+    pivots: np.ndarray  # (n_pivots,), least sizes at the points where they were chosen
 
     def at(self, t, jets, values):
         """Values and sizes (2, n, N) of each group, by name; the parameters (n_p,) or (n_p, N)."""
@@ -80,18 +73,7 @@ def _groups(equations):
 
 
 def affirmed(model, values):
-    """Whether the derivation of a model is certainly valid with other parameters.
-
-    Parameters
-    ----------
-    model : Model
-    values : (n_p,) array
-
-    Returns
-    -------
-    bool
-        If it is false, extended precision must decide.
-    """
+    """Whether a derivation is certainly valid with parameters (n_p,); if not, extended precision must decide."""
     return bool(affirmed_each(model, np.reshape(values, (-1, 1)))[0])
 
 
@@ -270,13 +252,7 @@ def _points_of(model):
 def _moved(model, at, values):
     """States (n_x, points) moved to the manifolds of other parameters (n_p, C).
 
-    Returns
-    -------
-    cases : (K,) array of int
-        Those whose points all reach it.
-    t : (K points,) array
-    jets : (n_z, K points) array
-        Case by case.
+    Returns the cases (K,) whose points all reach it, with times (K points,) [s] and jets (n_z, K points), case by case.
     """
     points, n_x = model.reduction.points, len(model.state_names)
     n_points, cases = len(points.t), values.shape[1]

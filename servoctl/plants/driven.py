@@ -15,27 +15,10 @@ from servoctl.spec.program import no_program
 def driven(plant, inputs=None, residuals=None):
     """The model of a plant under given inputs, within its limits of magnitude.
 
-    Parameters
-    ----------
-    plant : Plant
-        Without lag, transport delay and limits of rate.
-    inputs : dict of str to float, SX or callable, optional
-        Inputs by actuator, default 0: numbers, expressions of `q.t` such as paths, or functions that give them of
-        `q.t`.
-    residuals : dict of str to SX, optional
-        Residuals of a program that the inputs realise approximately; runs report them.
-
-    Returns
-    -------
-    Model
-        Its free initial values are all states that the material constraints leave; its outputs include the inputs.
-
-    Raises
-    ------
-    NameUnknown
-        For a name that is no actuator.
-    SpecificationError
-        For a plant with lag, delay or limits of rate, or an input that is no expression.
+    A plant with lag, transport delay or limits of rate is refused. Inputs by actuator, 0 by default, are numbers,
+    expressions of `q.t` such as paths, or functions that give them of `q.t`; `residuals` are those of a program that
+    the inputs realise approximately, which runs report. Free initial values are all states that the material
+    constraints leave; outputs include the inputs.
     """
     for what, value in (("lag", plant.lag), ("delay", plant.delay), ("rate_limits", plant.rate_limits)):
         if value:

@@ -29,26 +29,10 @@ CLEAR = 1e-6  # a mass matrix with unit diagonal and a larger least eigenvalue i
 class PlantEquations:
     """Expressions of the state x = (q, γ', lagged inputs) and of p = (parameters, damping, 1/lag, u, d).
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-    forces : str
-        Further generalised forces (n,) as a serialised function (see `Coordinates.as_function`); "" for none.
-    damped : tuple of int
-        Indices of the velocities with viscous damping.
-    lagged : tuple of int
-        Indices of the actuators that lag behind their command.
-    values : tuple of float, optional
-        Parameters at which orders and pivots are decided; default: those of the mechanism.
-
-    Attributes
-    ----------
-    choices : (str, tuple of int, tuple of int, tuple of float or None)
-        Forces, damped velocities, lagging actuators and parameters.
-    functions : dict of str to Compiled
-        Compiled functions by name.
-    others : list of PlantEquations
-        The same equations with pivots that were decided near states where these vanish.
+    Further generalised `forces` (n,) are a serialised function (see `Coordinates.as_function`), "" for none; `damped`
+    and `lagged` are indices of velocities with viscous damping and of actuators that lag behind their command. Orders
+    and pivots are decided at the parameters `values`, by default those of the mechanism; `choices` are these four. In
+    `others` are the same equations with pivots that were decided near states where these vanish.
     """
 
     def __init__(self, mechanism, forces, damped, lagged, values=None):
@@ -382,10 +366,7 @@ def plant_equations(mechanism, *choices):
 def equations_at(equations, values):
     """The same equations with parameters (n_p,) or (n_p, N), derived again at the first case that requires it.
 
-    Raises
-    ------
-    SpecificationError
-        If the cases need different equations.
+    Cases that need different equations are refused.
     """
     if equations.hold(values):
         return equations

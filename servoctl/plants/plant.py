@@ -109,15 +109,6 @@ def part_of(whole, mechanism):
     """The plant of a mechanism that `derive` left coordinates out of, with the numbers of the whole one.
 
     The whole plant, if it has no more coordinates, or if its forces couple them to those left out.
-
-    Parameters
-    ----------
-    whole : Plant
-    mechanism : Mechanism
-
-    Returns
-    -------
-    Plant
     """
     source, q = whole.mechanism, mechanism.q
     if not mechanism.left_out or source.q.names == q.names:

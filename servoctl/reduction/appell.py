@@ -21,31 +21,15 @@ SPLITS = 100  # choices of dependent coordinates that are tried where the first 
 
 @frozen
 class Realisation:
-    """Who supplies the reaction B μ, and which quasi-coordinates depend on the others.
+    """Who supplies the reaction B μ, and which quasi-coordinates depend on the others."""
 
-    Attributes
-    ----------
-    B : (n, b) SX
-        Directions of the reaction: the program's first, then those of material constraints.
-    actuation : (m, k) SX or None
-        Matrix A by which the first k multipliers give u = u_wish + A μ; None for an ideal program.
-    dependent, independent : tuple of int
-        Indices of the quasi-coordinates.
-    numbers : (b, n, N) array
-        Bᵀ at the points where the split was chosen.
-    settled : tuple of Row
-        Where the program leaves actuation open, the rows that hold whichever is taken; else none.
-    unreached : tuple of int
-        Independent quasi-coordinates whose balance no actuator enters: the settled rows contain it.
-    """
-
-    B: ca.SX
-    actuation: object
-    dependent: tuple
-    independent: tuple
-    numbers: np.ndarray
-    settled: tuple = ()
-    unreached: tuple = ()
+    B: ca.SX  # (n, b), directions of the reaction: the program's first, then those of material constraints
+    actuation: object  # (m, k) SX A, by which the first k multipliers give u = u_wish + A μ; None for an ideal program
+    dependent: tuple  # indices of quasi-coordinates
+    independent: tuple  # indices of the others
+    numbers: np.ndarray  # (b, n, N), Bᵀ at the points where the split was chosen
+    settled: tuple = ()  # where the program leaves actuation open, the rows that hold whichever is taken
+    unreached: tuple = ()  # independent quasi-coordinates whose balance no actuator enters: the settled rows contain it
 
     def __repr__(self):
         return f"Realisation({self.B.shape[1]} directions, dependent coordinates {self.dependent})"
@@ -107,10 +91,7 @@ def plant_solution(mechanism, material, forces, second, points):
 def require_inertia(mechanism, material, points):
     """Refuse an inertia matrix that is negative, or singular on the displacements that material constraints allow.
 
-    Raises
-    ------
-    SpecificationError
-        Naming the coordinates of the direction without inertia, or with a negative one.
+    The SpecificationError names the coordinates of the direction without inertia, or with a negative one.
     """
     require_positive(mechanism, points)
     q, n = mechanism.q, mechanism.q.n
@@ -132,10 +113,7 @@ def require_inertia(mechanism, material, points):
 def require_positive(mechanism, points):
     """Refuse an inertia matrix by which S is negative in a direction.
 
-    Raises
-    ------
-    SpecificationError
-        Naming the coordinates of the direction, and the parameters that are negative.
+    The SpecificationError names the coordinates of the direction, and the parameters that are negative.
     """
     matrices = np.moveaxis(clean(*points.matrix(mechanism.mass)), 2, 0)
     scaled, rows, columns = equilibrate(matrices)

@@ -30,26 +30,15 @@ TWICE = 2  # least-squares solutions of a level, in which rows are affine: the s
 class Block:
     """Rows, and the coordinates that they determine from jets of those of earlier blocks.
 
-    Attributes
-    ----------
-    rows : tuple of Row
-        A row's order is that of the highest jets of the block's own coordinates; its expression holds jets of earlier
-        ones, of any order.
-    places : tuple of int
-        The rows' places in the reduction.
-    columns : tuple of int
-        Quasi-velocities of the block.
-    coordinates : tuple of int
-        Coordinates whose rates follow from these and earlier ones.
-    order : tuple of (int, int)
-        Row and column of each pivot of its leading matrix; empty if they are chosen at points.
+    A row's order is that of the highest jets of the block's own coordinates; its expression holds jets of earlier ones,
+    of any order.
     """
 
     rows: tuple
-    places: tuple
-    columns: tuple
-    coordinates: tuple
-    order: tuple = ()
+    places: tuple  # of the rows in the reduction
+    columns: tuple  # quasi-velocities of the block
+    coordinates: tuple  # those whose rates follow from these and earlier ones
+    order: tuple = ()  # row and column of each pivot of its leading matrix; empty if they are chosen at points
 
     def leading(self, q):
         """∂ψ/∂γ^(order) in the block's own quasi-velocities, square SX."""
@@ -58,13 +47,7 @@ class Block:
 
 @frozen
 class Cascade:
-    """Blocks in the order in which they are solved.
-
-    Attributes
-    ----------
-    q : Coordinates
-    blocks : tuple of Block
-    """
+    """Blocks in the order in which they are solved."""
 
     q: object
     blocks: tuple
@@ -108,18 +91,8 @@ class Cascade:
     def continued(self, points, level, given=-1):
         """Jets near points that satisfy the rows up to a level; those of earlier blocks reach as far as this takes.
 
-        Parameters
-        ----------
-        points : Points
-        level : int
-        given : int, optional
-            Jets up to this level stay as they are; default: none.
-
-        Returns
-        -------
-        z : (nz, N) array
-            q and normalised Taylor coefficients, as in `Points`.
-        solved : (N,) array of bool
+        Jets up to the level `given` stay as they are, by default none. Returns q and normalised Taylor coefficients
+        (nz, N), as in `Points`, and whether each point is solved, (N,).
         """
         depths, q = self.depths(level), self.q
         z = np.zeros((q.nq + max(depths) * q.n, len(points.t)), dtype=REAL)
@@ -157,24 +130,10 @@ class Cascade:
     def along(self, points, given, level, correct=False, running=None, errors=None):
         """The motion by jets up to a given level, and Newton steps to its coordinates where it is `correct`ed first.
 
-        Parameters
-        ----------
-        points : Points
-            With the jets of `solved`, at which pivots are chosen.
-        given : int
-            The jets up to this level are symbols; 0 for coordinates alone.
-        level : int
-            To which jets are computed.
-        correct : bool, optional
-            Whether there are Newton steps. Rows have order 0 then.
-        running : callable, optional
-            What makes a `Running` of (motion, order, expressions); default: that class.
-        errors : dict of int to SX, optional
-            By place of a row: what is added to ψ^(given + 1 - order), as by error dynamics; default: nothing.
-
-        Returns
-        -------
-        Expressions
+        Jets up to the level `given` are symbols, 0 for coordinates alone; further ones are computed up to `level`.
+        Pivots are chosen at points with the jets of `solved`. With Newton steps rows have order 0. `running` makes a
+        `Running`, by default that class, of (motion, order, expressions). `errors` by place of a row is what is added
+        to ψ^(given + 1 - order), as by error dynamics.
         """
         motion = Expressions(self, points, given, correct)
         motion.running, motion.errors = running or Running, errors or {}
@@ -217,10 +176,7 @@ class Running:
 class _Follow(Motion):
     """A motion whose coefficients follow block by block.
 
-    Attributes
-    ----------
-    gamma, place : dict of int to list
-        Coefficients k of γ (n,) and of q (nq,).
+    `gamma` and `place` have by k the coefficients k of γ, a list of n, and of q, a list of nq.
     """
 
     running = Running
@@ -281,16 +237,9 @@ class _Follow(Motion):
 class Expressions(_Follow):
     """A motion by symbols of its first jets.
 
-    Attributes
-    ----------
-    levels : dict of int to SX
-        By place of the row: ψ^(given - order), as a function of t, q, ..., γ^(given).
-    newton : (nq,) SX
-        The Newton step to the coordinates.
-    pivots : list of SX
-        Of each block's elimination.
-    dropped : list of SX
-        What eliminations left out as zero.
+    `levels` has by place of the row ψ^(given - order), as a function of t, q, ..., γ^(given); `newton` is the Newton
+    step to the coordinates, a list of nq SX. `pivots` are those of each block's elimination, and `dropped` is what
+    eliminations left out as zero.
     """
 
     dropped = ()

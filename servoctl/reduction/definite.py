@@ -22,23 +22,12 @@ from servoctl.values import frozen
 
 @frozen
 class Definite(Realisation):
-    """A reaction whose multipliers follow from the definite matrix G M⁻¹B; no coordinate is dependent.
+    """A reaction whose multipliers follow from the definite matrix G M⁻¹B; no coordinate is dependent."""
 
-    Attributes
-    ----------
-    G : (b, n) SX
-        Leading gradients of the constraints, in the order of the columns of B.
-    mass : (n, n) SX
-    order : tuple of int
-        Of the constraints in the elimination: material ones first.
-    sizes : tuple of two arrays
-        M (n, n, N) and G M⁻¹B (b, b, N) at points.
-    """
-
-    G: ca.SX = None
-    mass: ca.SX = None
-    order: tuple = ()
-    sizes: tuple = field(default=(), repr=False)
+    G: ca.SX = None  # (b, n), leading gradients of the constraints, in the order of the columns of B
+    mass: ca.SX = None  # (n, n)
+    order: tuple = ()  # of the constraints in the elimination: material ones first
+    sizes: tuple = field(default=(), repr=False)  # M (n, n, N) and G M⁻¹B (b, b, N) at points
 
     def solve(self, force, second):
         """γ'' (n, 1) and μ (b, 1) of M γ'' = force + B μ, G γ'' = second, and the pivots."""
@@ -56,17 +45,10 @@ class Definite(Realisation):
 
 
 def definite(reduction):
-    """A reduction of second order whose elimination takes its pivots from the diagonal.
+    """A reduction of second order whose elimination takes its pivots from the diagonal, or None.
 
-    Parameters
-    ----------
-    reduction : Reduction
-        Whose balance and constraints determine γ''.
-
-    Returns
-    -------
-    Reduction or None
-        None where M, or G M⁻¹B, is not symmetric and positive definite at the points of the reduction.
+    The balance and the constraints of the reduction determine γ''. None where M, or G M⁻¹B, is not symmetric and
+    positive definite at its points, and where it has no constraints, no points, or a cascade.
     """
     r, q = reduction, reduction.mechanism.q
     constraints = [row for row in r.rows if row.kind != "dynamics"]

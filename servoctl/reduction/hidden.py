@@ -40,41 +40,11 @@ class Deep(Exception):
 def complete(q, rows, context, starts=None, most=None, so_far=None):
     """Replace rows by hidden constraints until their leading matrix has full row rank.
 
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-        At most n; each with its settled order.
-    context : Context
-    starts : Points, optional
-        Starts for points of the manifold.
-    most : int, optional
-        Derivatives of a residual or a balance in a row, at most.
-    so_far : tuple, optional
-        Of a `Deep`: where the search with these arguments ended.
-
-    Returns
-    -------
-    rows : list of Row
-    rank : Rank
-        Rank of the final leading matrix, with its margins; `dropped` is the largest of all leading matrices before it.
-    points : Points
-        Points of the final manifold.
-    pivots : list of (str, SX)
-        Pivots by which the combinations divide, each with a description.
-
-    Raises
-    ------
-    SpecificationError
-        If constraints depend on each other or contradict each other.
-    NotRealisable
-        If the dependence involves rows of (3.18).
-    SingularProgram
-        If a row's gradient vanishes on its own solutions, or a rank is undecided in double precision.
-    InconsistentStart
-        If no state satisfies the rows.
-    Deep
-        If there are more derivatives than `most`.
+    Takes at most n rows, with settled orders. Returns rows, their rank, whose `dropped` is the largest on the way,
+    points of their manifold, and pivots (description, SX). Raises SpecificationError if constraints depend on or
+    contradict each other, NotRealisable if rows of (3.18) are involved, SingularProgram if a gradient vanishes where
+    its row holds or a rank is undecided, InconsistentStart if no state satisfies the rows, and `Deep`, from whose
+    `so_far` it can go on, if a row would hold more than `most` derivatives of a residual or a balance.
     """
     rows, pivots, points, dropped = so_far or (list(rows), [], starts, 0.0)
     while True:

@@ -34,31 +34,17 @@ ALONE = 0.5  # s, the neighbourhood of a single switch
 
 @frozen
 class Knots:
-    """Instants at which residuals switch between smooth pieces.
+    """Instants at which residuals switch between smooth pieces."""
 
-    Attributes
-    ----------
-    times : tuple of float
-        Ascending [s].
-    classes : dict of str to list of (float, int)
-        For each residual the instants at which it is not smooth, with its class C^k there.
-    """
-
-    times: tuple
-    classes: dict
+    times: tuple  # ascending [s]
+    classes: dict  # for each residual a list of (instant, k): it is not smooth there, but of class C^k
 
 
 class Switches:
     """The switches in residuals that depend on t and parameters alone.
 
-    Parameters
-    ----------
-    q : Coordinates
-    residuals : dict of str to SX
-        Those without such switches are left out.
-    parameters : tuple of SX
-    timed : list of (int, int or None), optional
-        Sides of the switches, as nodes of the tape; they are searched by default.
+    Residuals without such switches are left out. `timed` are the sides of each switch, (int, int or None), as nodes of
+    the tape; they are searched by default.
     """
 
     def __init__(self, q, residuals, parameters, timed=None):
@@ -143,13 +129,9 @@ class Switches:
         return bool(self.timed)
 
     def times(self, values, span=None):
-        """Instants at which a switch changes sides, ascending.
+        """Instants at which a switch changes sides, ascending, for parameters `values` (n_p,).
 
-        Parameters
-        ----------
-        values : (n_p,) array
-        span : (t0, t1), optional
-            A span that is scanned for switches that are not affine in t.
+        A span (t0, t1) is scanned for switches that are not affine in t, and so is the time between those that are.
         """
         return self._times(values, *self._affine(values), span)
 
@@ -341,17 +323,10 @@ class Switches:
         return series
 
     def classes(self, values, needs, times):
-        """The class of each residual at each switching instant.
+        """The class of each residual at each switching instant, as lists of (time, class) by name.
 
-        Parameters
-        ----------
-        needs : dict of str to int
-            Highest derivative of each residual that is inspected.
-
-        Returns
-        -------
-        dict of str to list of (time, class)
-            Instants at which such a derivative jumps; the class is the order of the lowest of them less one.
+        These are the instants at which a derivative jumps, of those up to the residual's order in `needs`; the class is
+        the order of the lowest of them less one.
         """
         if not times:
             return {}
@@ -419,25 +394,10 @@ def _changes(side, low, high, first):
 
 
 def jump(before, after, h):
-    """Jumps of a function's Taylor coefficients at an instant, from series on either side of it.
+    """Jumps (n,) of a function's Taylor coefficients at an instant, from those at -h and h [s] from it.
 
-        before              instant               after
-    ------|--------------------|--------------------|------> t
-         -h     shifted to     0     shifted to     h
-
-    Where the function is smooth, the shifted series differ by their truncation errors, which fall with h; a jump
-    does not.
-
-    Parameters
-    ----------
-    before, after : (n,) arrays
-        Taylor coefficients at -h and at h.
-    h : float
-        [s]
-
-    Returns
-    -------
-    (n,) array
+    Both series are shifted to the instant. Where the function is smooth, they differ by their truncation errors, which
+    fall with h; a jump does not.
     """
     return np.subtract(_shift(after, -h), _shift(before, h))
 
@@ -477,10 +437,7 @@ _PIECE = {
 def require_smooth(switches, values, needs, span=None):
     """The knots of paths that have the class that each residual needs, a dict by name.
 
-    Raises
-    ------
-    SpecificationError
-        If a path has a lower class at an instant, such as C^2 instead of C^4 at t = 3 s.
+    Raises SpecificationError if a path has a lower class at an instant, such as C^2 instead of C^4 at t = 3 s.
     """
     knots = switches.knots(values, needs, span)
     for name, instants in knots.classes.items():

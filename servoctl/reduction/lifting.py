@@ -17,17 +17,9 @@ SIGNS = {"add": 1.0, "sub": -1.0}  # of the second term
 def lifted(expressions, unknowns):
     """The matrix of expressions f = A x + f(0) that are linear in unknowns x, in x and further unknowns z.
 
-    Parameters
-    ----------
-    expressions : (m,) SX
-    unknowns : (n,) SX
-        Symbols.
-
-    Returns
-    -------
-    (m + k, n + k) SX or None
-        The rows of f - f(0) = P x + Q z, then those of R x + (S - 1) z = 0, which define the k shared sums z: S is
-        strictly lower triangular. None where other operations are made of unknowns than sums and products with factors.
+    An (m + k, n + k) SX for m expressions and n symbols x: the rows of f - f(0) = P x + Q z, then those of
+    R x + (S - 1) z = 0, which define the k shared sums z; S is strictly lower triangular. None where other operations
+    are made of unknowns than sums and products with factors.
     """
     expressions = cse(expressions)
     tape = Tape(ca.symvar(expressions), expressions.elements())

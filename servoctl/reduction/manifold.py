@@ -33,32 +33,16 @@ POINTS_SEED = 1907  # of the random starts
 
 @frozen
 class Points:
-    """Points in jet space.
-
-    Attributes
-    ----------
-    q : Coordinates
-    t : (N,) array
-    z : (nq + K n, N) array
-        q and the normalised Taylor coefficients γ_[k] = γ^(k)/k!, k = 1..K.
-    parameters : tuple of SX
-    values : (n_p,) array
-    residual : (N,) array
-        Largest scaled residual at each point.
-    book : Book
-        Tapes of the scalars that were evaluated.
-    scales : Scales, optional
-        Usual sizes of jets, by which steps and residuals are measured; default 1 each.
-    """
+    """Points in jet space."""
 
     q: object
-    t: np.ndarray
-    z: np.ndarray
-    parameters: tuple
-    values: np.ndarray
-    residual: np.ndarray
-    book: Book = field(default_factory=Book, repr=False, compare=False)
-    scales: object = None
+    t: np.ndarray  # (N,) [s]
+    z: np.ndarray  # (nq + K n, N): q and the normalised Taylor coefficients γ_[k] = γ^(k)/k!, k = 1..K
+    parameters: tuple  # SX
+    values: np.ndarray  # (n_p,), of the parameters
+    residual: np.ndarray  # (N,), the largest scaled residual at each point
+    book: Book = field(default_factory=Book, repr=False, compare=False)  # tapes of the scalars that were evaluated
+    scales: object = None  # Scales: usual sizes of jets, by which steps and residuals are measured; default 1 each
     _values: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self):
@@ -140,23 +124,9 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     """Solve a flow's rows for jets: level by level, then by damped Gauss-Newton steps on all levels.
 
     Where the levels lead nowhere, damped steps for the rows of q alone come first; a point without these has no jets.
-
-    Parameters
-    ----------
-    flow : Flow
-    t : (N,) array
-    z : (nz, N) array
-    iterations : int, optional
-        Damped steps on all levels.
-    natural : bool, optional
-        Whether damped steps are judged by the Newton correction at their end instead of the residual: that is the same
-        for all combinations of the rows, and leads on where rows are nearly dependent and curved.
-
-    Returns
-    -------
-    z : (nz, N) array
-    residual : (N,) array
-        Largest residual, each relative to the size of its gradient times that of the jets.
+    If `natural`, damped steps are judged by the Newton correction at their end instead of the residual: that is the
+    same for all combinations of the rows, and leads on where rows are nearly dependent and curved. Returns z (nz, N)
+    and the largest residual of each point (N,), relative to the size of its gradient times that of the jets.
     """
     z, t = np.array(z, dtype=REAL), np.asarray(t, dtype=REAL)
     if not len(flow.equations):
@@ -305,25 +275,10 @@ def _normal_steps(a, b):
 
 
 def sample(q, rows, level, context, starts=None, flow=None):
-    """Seeded random points that satisfy rows and their derivatives up to a level.
+    """Seeded random points that satisfy rows and their derivatives up to a level of jets.
 
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-    level : int
-        Highest level of the jets.
-    context : Context
-        Parameters and their values, the window of times, the guess.
-    starts : Points, optional
-        Earlier points, whose jets are starts beside random ones.
-    flow : Flow, optional
-        A flow of the same rows and level.
-
-    Returns
-    -------
-    Points
-        At most `POINTS`; none if no start converges.
+    At most `POINTS`; none if no start converges. Starts are random, by the window and the guess of the context, beside
+    the jets of earlier points `starts`. A `flow`, if given, has the same rows and level.
     """
     t, z = _random_starts(q, level, context)
     if starts is not None and len(starts.t):
@@ -389,34 +344,14 @@ def _solved(starting, flow, some, natural=False):
 
 @frozen
 class Context:
-    """Where points are sampled, and with which parameters.
+    """Where points are sampled, and with which parameters."""
 
-    Attributes
-    ----------
-    parameters : tuple of SX
-    values : (n_p,) array
-    window : (t0, t1)
-        Window of the times [s].
-    guess : dict of str to float
-        Values of jets about which points are searched.
-    spread : float
-        Relative width of the starts about guessed values.
-    sizes : dict of str to float
-        Usual sizes of jets, by which a guess near zero is spread; default `scales`.
-    scales : Scales, optional
-        Usual sizes of jets, by which jets without a guess are spread; default 1 each.
-    book : Book
-        Tapes of the scalars that were evaluated.
-    saddle : SX, optional
-        [M G_mᵀ; G_m 0]: points where it is singular are left out, where there are others.
-    """
-
-    parameters: tuple
-    values: np.ndarray
-    window: tuple
-    guess: dict
-    spread: float = SPREAD
-    sizes: dict = field(default_factory=dict)
-    scales: object = None
-    book: Book = field(default_factory=Book, repr=False, compare=False)
-    saddle: object = None
+    parameters: tuple  # SX
+    values: np.ndarray  # (n_p,), of the parameters
+    window: tuple  # (t0, t1) of the times [s]
+    guess: dict  # values of jets by name about which points are searched
+    spread: float = SPREAD  # relative width of the starts about guessed values
+    sizes: dict = field(default_factory=dict)  # of jets by name, by which a guess near zero is spread; default `scales`
+    scales: object = None  # Scales: usual sizes of jets, by which jets without a guess are spread; default 1 each
+    book: Book = field(default_factory=Book, repr=False, compare=False)  # tapes of the scalars that were evaluated
+    saddle: object = None  # SX [M G_mᵀ; G_m 0]: points where it is singular are left out, where there are others

@@ -21,24 +21,12 @@ DRIFTED = 1e-6  # of its terms: below this a slope may be due to drift; above, i
 
 @frozen(eq=False)
 class Orders:
-    """The slopes on whose vanishing the orders of rows rest; false if there are none.
+    """The slopes on whose vanishing the orders of rows rest; false if there are none."""
 
-    Attributes
-    ----------
-    decided : tuple of Row
-        Rows whose orders were decided.
-    rows : tuple of Row
-        Rows of the manifold.
-    top : int
-        Highest order of jets on the manifold.
-    points : Points
-        Points of the manifold, where the slopes vanish.
-    """
-
-    decided: tuple
-    rows: tuple
-    top: int
-    points: Points
+    decided: tuple  # rows whose orders were decided
+    rows: tuple  # of the manifold
+    top: int  # highest order of jets on the manifold
+    points: Points  # of the manifold, where the slopes vanish
 
     def __bool__(self):
         return any(row.vanishing for row in self.decided)
@@ -71,22 +59,10 @@ class Orders:
         return not self._alive(points, np.maximum(jets, 1.0), terms, ENTRY, ENTRY).any()
 
     def first_change(self, t, jets, values):
-        """The first sample of a motion at which the order of a row is another one.
+        """The first sample of a motion at which the order of a row is another one: its index, and the row's name.
 
-        Parameters
-        ----------
-        t : (N,) array
-            [s]
-        jets : (n_z, N) array
-            q, γ', and perhaps higher jets.
-        values : (n_p,) array
-
-        Returns
-        -------
-        int or None
-            The index of the sample.
-        str
-            Name of the row; empty if there is no such sample.
+        The motion is t (N,) [s] with jets (n_z, N), q, γ', and perhaps higher ones, and parameters `values` (n_p,). If
+        there is no such sample, (None, "").
         """
         known = np.flatnonzero(np.isfinite(jets).all(axis=0)) if self else ()
         if not len(known):

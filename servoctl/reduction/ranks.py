@@ -30,24 +30,13 @@ SWEEPS = 6  # of equilibration; each takes the square root of the remaining fact
 
 @frozen
 class Rank:
-    """A rank and how clear it is.
-
-    Attributes
-    ----------
-    rank : int
-    kept : float
-        Smallest equilibrated pivot that counts; inf if none does.
-    dropped : float
-        Largest equilibrated pivot that does not count; 0 if all do.
-    rows, columns : tuple of int
-        Places of the pivots, largest first.
-    """
+    """A rank and how clear it is."""
 
     rank: int
-    kept: float
-    dropped: float
-    rows: tuple
-    columns: tuple
+    kept: float  # smallest equilibrated pivot that counts; inf if none does
+    dropped: float  # largest equilibrated pivot that does not count; 0 if all do
+    rows: tuple  # of the pivots that count, in the order of elimination
+    columns: tuple  # likewise
 
     @property
     def clear(self):
@@ -63,14 +52,7 @@ def clean(values, sizes):
 def equilibrate(matrix):
     """Scale rows and columns so that the largest entries are near 1; zero rows and columns stay.
 
-    Parameters
-    ----------
-    matrix : (..., m, n) array
-
-    Returns
-    -------
-    scaled, row_factors, column_factors
-        (..., m, n), (..., m) and (..., n) arrays.
+    Returns the scaled matrices (..., m, n) with the factors of rows (..., m) and of columns (..., n).
     """
     a = np.array(matrix, dtype=np.longdouble)
     rows, columns = np.ones(a.shape[:-1], dtype=a.dtype), np.ones(a.shape[:-2] + a.shape[-1:], dtype=a.dtype)
@@ -101,18 +83,9 @@ def decide(matrix, resolved=RESOLVED):
 
 
 def decide_each(matrices, resolved=RESOLVED):
-    """The rank of each of N matrices, by equilibration and complete pivoting.
+    """The rank of each of N matrices (m, n, N), whose entries are cleaned, by equilibration and complete pivoting.
 
-    Parameters
-    ----------
-    matrices : (m, n, N) array
-        With entries cleaned.
-    resolved : float, optional
-        Equilibrated pivots above it count.
-
-    Returns
-    -------
-    list of Rank
+    Equilibrated pivots above `resolved` count.
     """
     a, _, _ = equilibrate(np.moveaxis(matrices, 2, 0))
     thin = min(a.shape[1:]) >= LARGE and np.count_nonzero(a) <= THIN * a.size
@@ -168,19 +141,10 @@ def _sparse_pivots(a):
 
 
 def decide_all(values, sizes):
-    """The generic rank over several points: the highest rank, at the clearest point that has it.
+    """The generic rank over several points, which is the highest, and the index of the clearest point that has it.
 
-    Parameters
-    ----------
-    values, sizes : (m, n, N) arrays
-        The matrix and the sizes of its entries at N points.
-
-    Returns
-    -------
-    Rank
-        `kept` is the smallest over the points of that rank, `dropped` the largest over all points.
-    index : int
-        The point of that rank whose smallest kept pivot is largest.
+    Values and sizes are those of the entries, (m, n, N). The clearest point is that whose smallest kept pivot is
+    largest; `kept` is the smallest and `dropped` the largest over all points of that rank.
     """
     return generic(decide_each(clean(values, sizes)))
 
@@ -196,18 +160,7 @@ def generic(ranks):
 
 
 def combination(rows, target):
-    """Coefficients c with c @ rows = target, and the residual relative to the target.
-
-    Parameters
-    ----------
-    rows : (m, n) array
-    target : (n,) array
-
-    Returns
-    -------
-    c : (m,) array
-    residual : float
-    """
+    """Coefficients c (m,) with c @ rows = target, of rows (m, n), and the residual relative to the target."""
     scaled, row_factors, _ = equilibrate(np.vstack([rows, target[None, :]]))
     c, residual = refined(scaled[:-1], scaled[-1], CUTOFF)
     largest = float(np.abs(scaled[-1].astype(float)).max(initial=0.0))
@@ -226,16 +179,7 @@ def refined(rows, target, cutoff):
 def solve_clean(matrix, right):
     """Solve A X = B in extended precision, with zeros for all differences that are rounding errors of their terms.
 
-    Entries that vanish in exact arithmetic are then zero in the solution.
-
-    Parameters
-    ----------
-    matrix : (n, n) array
-    right : (n, m) array
-
-    Returns
-    -------
-    (n, m) array
+    Entries that vanish in exact arithmetic are then zero in the solution (n, m).
     """
     a, row_factors, column_factors = equilibrate(matrix)
     b = np.asarray(right, dtype=np.longdouble) * row_factors[:, None]
@@ -286,32 +230,12 @@ def pivot_order(matrix, numbers):
 
 
 def eliminate(matrix, right, numbers, diagonal=False, order=(), in_order=False):
-    """Solve A X = B symbolically.
+    """Solve A X = B symbolically: the solution (n, m) SX, and the pivots in the order of elimination.
 
-    Parameters
-    ----------
-    matrix : (n, n) SX
-    right : (n, m) SX
-    numbers : (n, n, N) array
-        A at N points, cleaned of rounding, where pivots are chosen.
-    diagonal : bool, optional
-        Whether pivots are diagonal entries, as is stable for definite matrices.
-    order : sequence of (int, int), optional
-        Row and column of each pivot; default: chosen by the numbers.
-    in_order : bool, optional
-        Among pivots of the same fill-in the one of the first row is taken instead of the largest: chains of bodies are
-        eliminated from end to end, with less fill-in later.
-
-    Returns
-    -------
-    solution : (n, m) SX
-    pivots : list of SX scalars
-        In the order of elimination.
-
-    Raises
-    ------
-    SingularProgram
-        If A is singular at a point.
+    Pivots are chosen by `numbers` (n, n, N), A at N points cleaned of rounding, unless `order` has the row and column
+    of each. If `diagonal`, they are diagonal entries, as is stable for definite matrices. If `in_order`, among pivots
+    of the same fill-in the one of the first row is taken instead of the largest: chains of bodies are eliminated from
+    end to end, with less fill-in later. Raises SingularProgram if A is singular at a point.
     """
     n, m = right.shape
     system = _System(matrix, right, numbers, diagonal, in_order)

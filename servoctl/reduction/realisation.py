@@ -23,32 +23,12 @@ from servoctl.spec.mechanism import inverse_directions
 
 
 def realisation(mechanism, program, constraints, points, context):
-    """The realisation of a program by ideal reactions or by the mechanism's actuators.
+    """The realisation of a program by ideal reactions or by the mechanism's actuators, with points and pivots.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-    program : Program
-    constraints : list of Row
-        Program rows and material rows, the latter of full row rank.
-    points : Points
-        Points on the manifold of the constraints.
-    context : Context
-
-    Returns
-    -------
-    realised : Realisation
-    points : Points
-        Points on the manifold of its settled rows, if it has any; else those passed.
-    pivots : list of (str, SX)
-        Pivots by which the settled rows divide, each with a description.
-
-    Raises
-    ------
-    NotRealisable
-        If the residuals outnumber the independent actuators, or the actuators cannot move them independently.
-    SpecificationError
-        For weights or wishes of unknown actuators, and for wishes where the program determines the actuation.
+    Material rows among the constraints have full row rank; points lie on the manifold of the constraints, those
+    returned on that of the settled rows, if there are any. Pivots are (description, SX). Raises NotRealisable if the
+    residuals outnumber the independent actuators, or these cannot move them independently, and SpecificationError for
+    weights by the inertia or wishes that do not fit, such as wishes where the program determines the actuation.
     """
     if program.by == "ideal":
         G = [row.gradient(mechanism.q).T for row in constraints if row.kind == "program"]

@@ -39,48 +39,22 @@ HELD = 1e-9  # residual, relative to the size of its terms, at points where a re
 
 @frozen
 class Reduction(Packed):
-    """The rows ψ_a = 0 of a motion, with its hidden constraints, and who realises the program.
-
-    Attributes
-    ----------
-    mechanism : Mechanism
-    program : Program
-    rows : tuple of Row
-        n rows, program rows first, then material ones, then those of (3.18).
-    realisation : Realisation
-    rank : Rank
-        Rank of the leading matrix of the rows, with its margins.
-    points : Points
-        Seeded points on the manifold of the rows and their derivatives.
-    pivots : tuple of (str, SX)
-        Pivots by which the rows divide, each with a description.
-    knots : Knots
-    switches : Switches
-    context : Context
-    original : dict of str to Row
-        Rows of the designer's residuals and material constraints, by name.
-    cascade : Cascade, optional
-        The rows by blocks, where they are deep.
-    entries_dropped : tuple of SX
-        What the eliminations of the derivation left out, as it vanishes identically.
-    order : tuple of (int, int)
-        Row and column of each pivot of the leading matrix; empty if they are chosen at the points.
-    """
+    """The rows ψ_a = 0 of a motion, with its hidden constraints, and who realises the program."""
 
     mechanism: Mechanism
     program: Program
-    rows: tuple
+    rows: tuple  # n rows, program rows first, then material ones, then those of (3.18)
     realisation: Realisation
-    rank: Rank
-    points: Points
-    pivots: tuple
+    rank: Rank  # of the leading matrix of the rows, with its margins
+    points: Points  # seeded points on the manifold of the rows and their derivatives
+    pivots: tuple  # (str, SX): pivots by which the rows divide, each with a description
     knots: Knots
     switches: Switches
     context: Context
-    original: dict
-    cascade: Cascade | None = None
-    entries_dropped: tuple = ()
-    order: tuple = ()
+    original: dict  # rows of the designer's residuals and material constraints, by name
+    cascade: Cascade | None = None  # the rows by blocks, where they are deep
+    entries_dropped: tuple = ()  # SX that the eliminations of the derivation left out, as they vanish identically
+    order: tuple = ()  # row and column of each pivot of the leading matrix; empty if they are chosen at the points
 
     def __repr__(self):
         rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
@@ -203,27 +177,11 @@ def smoothness(switches, rows):
 def reduce(mechanism, program, guess=None, near=None, values=None):
     """Derive the rows of a motion: eq. (3.18), hidden constraints, ranks on the manifold.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-    program : Program
-    guess : dict of str to float, optional
-        Values of coordinates or derivatives about which points of the manifold are searched. Where they are not
-        ordinary numbers, or points of ordinary size lead to no reduction, points have the usual sizes of jets.
-    near : (t, jets, sizes), optional
-        An instant at which pivots are chosen, with dicts of jets and of their sizes along the motion; points have the
-        usual sizes of jets if there is a guess.
-    values : (n_p,) array, optional
-        Parameters at which ranks are decided; default: those of the mechanism.
-
-    Returns
-    -------
-    Reduction
-
-    Raises
-    ------
-    SpecificationError, NotRealisable, SingularProgram, InconsistentStart
-        See `hidden.complete` and `appell.realisation`.
+    Points of the manifold are searched about `guess`, values of coordinates or derivatives by name. Where these are not
+    ordinary numbers, or points of ordinary size lead to no reduction, points have the usual sizes of jets. `near`
+    (t [s], jets, sizes) is an instant at which pivots are chosen, with dicts of jets and of their sizes along the
+    motion; beside a guess, points then have the usual sizes. Ranks are decided at the parameters `values` (n_p,), by
+    default those of the mechanism. For errors see `hidden.complete` and `realisation.realisation`.
     """
     program = require_parts(mechanism, program, guess)
     q = mechanism.q
@@ -283,19 +241,10 @@ def _by_points(mechanism, program, switches, balance, context):
 
 
 def holds(reduction, values):
-    """Whether a reduction is valid at other parameters than those at which its ranks were decided.
+    """Whether a reduction is valid at other parameters (n_p,) than those at which its ranks were decided.
 
     At points that satisfy its rows with these parameters, the original residuals and the balance must hold, too; every
     slope on whose vanishing an order rests must vanish there, every rank must be the same, and no pivot far weaker.
-
-    Parameters
-    ----------
-    reduction : Reduction
-    values : (n_p,) array
-
-    Returns
-    -------
-    bool
     """
     q, r = reduction.mechanism.q, reduction
     context = replace(r.context, values=values)

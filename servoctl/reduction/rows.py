@@ -29,15 +29,9 @@ BESIDE = 0.5  # relative distance of the points with which solutions are compare
 
 @frozen
 class Balance:
-    """The key of the balance r, or of one component of it, beside the names of residuals.
+    """The key of the balance r, or of one component of it, beside the names of residuals."""
 
-    Attributes
-    ----------
-    component : str
-        Name of a coordinate or quasi-velocity; empty for the whole balance.
-    """
-
-    component: str = ""
+    component: str = ""  # name of a coordinate or quasi-velocity; empty for the whole balance
 
     def __str__(self):
         return f"the force on {self.component}" if self.component else "the balance"
@@ -47,42 +41,24 @@ class Balance:
 class Row:
     """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
 
-    Attributes
-    ----------
-    expression : SX scalar
-    order : int
-        Highest k with ∂ψ/∂γ^(k) ≠ 0 on the manifold; 0 for q alone, -1 for t alone.
-    name : str
-    kind : {"program", "material", "dynamics"}
-        Its origin.
-    affine : bool
-        Whether it is affine in γ^(order).
-    story : str
-        The combination that it is, if it is a hidden constraint.
-    uses : dict of (str or Balance) to int
-        Highest derivative of each residual, and of the balance, that ψ contains.
-    parts : tuple of SX
-        Terms whose sum ψ is, where these may cancel: beside them rounding of folded constants is zero.
-    vanishing : tuple of (SX, SX, SX)
-        What the row's order rests on: slopes that vanish at the points of its derivation, but not identically; the jets
-        in which they are slopes, or products of two; and the expression ψ that they are slopes of.
-    slopes : (1, n) SX, optional
-        A leading gradient that differs from ∂ψ/∂γ^(order) by multiples of other rows' only.
-    columns : tuple of int, optional
-        The quasi-velocities whose jets count; those of others are functions of time. Default: all.
+    Its order rests on `vanishing`: slopes that vanish at the points of its derivation, but not identically; the jets in
+    which they are slopes, or products of two; and the expression ψ that they are slopes of. `parts` are terms whose sum
+    ψ is, where these may cancel: beside them rounding of folded constants is zero. `slopes` is a leading gradient that
+    differs from ∂ψ/∂γ^(order) by multiples of other rows' only. Jets of quasi-velocities outside `columns` are
+    functions of time.
     """
 
     expression: ca.SX
-    order: int
+    order: int  # highest k with ∂ψ/∂γ^(k) ≠ 0 on the manifold; 0 for q alone, -1 for t alone
     name: str
-    kind: str
-    affine: bool = True
-    story: str = ""
-    uses: dict = field(default_factory=dict)
-    parts: tuple = field(default=(), repr=False, compare=False)
-    vanishing: tuple = field(default=(), repr=False)
-    slopes: object = field(default=None, repr=False)
-    columns: tuple | None = field(default=None, repr=False)
+    kind: str  # its origin: "program", "material" or "dynamics"
+    affine: bool = True  # in γ^(order)
+    story: str = ""  # the combination that it is, if it is a hidden constraint
+    uses: dict = field(default_factory=dict)  # highest derivative of each residual, and of the balance, in ψ
+    parts: tuple = field(default=(), repr=False, compare=False)  # SX
+    vanishing: tuple = field(default=(), repr=False)  # (SX, SX, SX) each
+    slopes: object = field(default=None, repr=False)  # (1, n) SX, or None
+    columns: tuple | None = field(default=None, repr=False)  # quasi-velocities whose jets count; None: all
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
 
     def gradient(self, q, level=None):
@@ -148,12 +124,8 @@ def row_levels(q, rows, top):
 def as_rows(q, named, kind, context):
     """Rows of residuals by name, of kind "program" or "material", with their true orders.
 
-    Raises
-    ------
-    SpecificationError
-        If a residual depends on no coordinate.
-    SingularProgram
-        If a residual is a square: its gradient vanishes wherever the residual does.
+    Raises SpecificationError if a residual depends on no coordinate, and SingularProgram if it is a square: its
+    gradient vanishes wherever the residual does.
     """
     rows = [Row(q.on_spheres(e), max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
     settled = settle_alone(q, rows, context)
@@ -323,12 +295,8 @@ def leading(q, rows, points):
 def settle_alone(q, rows, context):
     """The true order of each row by itself; see `settle`.
 
-    For most rows one evaluation of all leading gradients decides, and `settle` treats the rest.
-
-    Returns
-    -------
-    list of (Row, (n, N) array or None)
-        Each row, and the values of its leading gradient at the points if that evaluation decided.
+    For most rows one evaluation of all leading gradients decides, and `settle` treats the rest. Each row comes with the
+    values (n, N) of its leading gradient at the points, None if that evaluation did not decide.
     """
     levels = [q.order(row.expression) for row in rows]
     settled = [None] * len(rows)
@@ -347,24 +315,9 @@ def settle_alone(q, rows, context):
 def settle(q, row, others, context, starts=None):
     """Determine the order of a row on the manifold of other rows, and eliminate jets that it only seems to contain.
 
-    From the highest jet downwards: a jet with a zero gradient is set to zero, and a jet that the other rows
-    determine is replaced by their solution.
-
-    Parameters
-    ----------
-    q : Coordinates
-    row : Row
-        Its `order` is an upper bound.
-    others : list of Row
-    context : Context
-    starts : Points, optional
-        Starts for points of the manifold.
-
-    Returns
-    -------
-    Row or None
-        With its true order, -1 for none; None if no point satisfies the other rows.
-    points : Points
+    From the highest jet downwards: a jet with a zero gradient is set to zero, and a jet that the other rows determine
+    is replaced by their solution. The row's own `order` is an upper bound. Returns the row with its true order, -1 for
+    none, or None if no point satisfies the other rows, and points of their manifold, for which `starts` are starts.
     """
     level = max([row.order, q.order(row.expression), 0, *(other.order for other in others)])
     points = sample(q, others, level, context, starts=starts)
@@ -472,19 +425,9 @@ def _eliminated(q, row, j, values, lower, points):
 def dependence(numbers, first=0):
     """The first row whose leading gradient is a combination of those before it, and that combination.
 
-    Parameters
-    ----------
-    numbers : (rows, n, N) array
-        The leading matrix at points of the same rank.
-    first : int, optional
-        Dependent rows before it are left out.
-
-    Returns
-    -------
-    support : list of int
-        Indices of the rows of the combination, the dependent one last; empty if no row is dependent.
-    weights : (len(support),) array
-        Smallest size over the points of each equilibrated coefficient; 1 for the dependent row.
+    `numbers` (rows, n, N) is the leading matrix at points of the same rank; dependent rows before `first` are left out.
+    Returns the indices of the combined rows, the dependent one last, none if no row is dependent; and of each the
+    smallest size of its equilibrated coefficient over the points, 1 for the dependent row.
     """
     scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2)
     basis = []

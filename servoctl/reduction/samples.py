@@ -36,22 +36,9 @@ class Noise(NamedTuple):
 def warn_of_samples(switches, values, needs, times):
     """Warn of splines through samples that do not determine a derivative that the actuation contains.
 
-    Only of those that time alone, or a time law, runs through.
-
-    Parameters
-    ----------
-    switches : Switches
-    values : (n_p,) array
-        Parameters.
-    needs : dict of str to int
-        Highest derivative of each residual that the actuation contains.
-    times : tuple of float
-        Ascending instants at which residuals switch [s].
-
-    Warns
-    -----
-    RuntimeWarning
-        For noise, and for ends that do not fit the samples, such as ends at rest of a motion.
+    A RuntimeWarning tells of noise, and of ends that do not fit the samples, such as ends at rest of a motion, in
+    splines that time alone, or a time law, runs through. `needs` has the highest derivative of each residual that the
+    actuation contains; `times` are ascending instants at which residuals switch [s].
     """
     ends, noises = [], []
     for name, k in needs.items():
@@ -98,19 +85,10 @@ def _of_ends(names, k, _):
 
 
 class Samples:
-    """The samples that a residual takes from a spline.
+    """The samples that the residual `name` takes from a spline.
 
-    Parameters
-    ----------
-    switches : Switches
-    values : (n_p,) array
-    name : str
-        Of the residual.
-    argument : int
-        The node that runs through the knots.
-    knots : (n,) array
-    span : (t0, t1)
-        When it does [s].
+    `argument` is the node that runs through the knots (n,), within the span (t0, t1) [s]; `values` (n_p,) are
+    parameters.
     """
 
     def __init__(self, switches, values, name, argument, knots, span):

@@ -23,20 +23,11 @@ TERM_POINTS = 3  # points at which terms are compared
 
 @frozen(eq=False)
 class Scales:
-    """Usual sizes of jets.
+    """Usual sizes of jets."""
 
-    Attributes
-    ----------
-    coordinates : (nq,) array
-    rates : (n,) array
-        Sizes of γ' times `time`.
-    time : float
-        [s]
-    """
-
-    coordinates: np.ndarray
-    rates: np.ndarray
-    time: float = 1.0
+    coordinates: np.ndarray  # (nq,)
+    rates: np.ndarray  # (n,), sizes of γ' times `time`
+    time: float = 1.0  # [s]
 
     @property
     def ordinary(self):
@@ -49,22 +40,10 @@ class Scales:
 
 
 def usual(mechanism, program, guess, values, window):
-    """The scales of a specification.
+    """The scales of a specification; sizes that are ordinary are 1.
 
-    Parameters
-    ----------
-    mechanism : Mechanism
-    program : Program
-    guess : dict of str to float
-        Values of jets.
-    values : (n_p,) array
-    window : callable
-        The window of times (t0, t1) [s] for a time scale.
-
-    Returns
-    -------
-    Scales
-        Sizes that are ordinary are 1.
+    `guess` has values of jets by name, `values` (n_p,) are parameters, and `window` gives the window of times
+    (t0, t1) [s] for a time scale.
     """
     terms = _Terms(mechanism, program, values)
     if terms.f.has_free():

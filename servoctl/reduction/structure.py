@@ -174,21 +174,9 @@ class Directions:
 
 
 def directions(reduction, t, jets, values):
-    """The directions of actuators and of the program at each instant of a motion.
+    """The `Directions` of actuators and of the program at each instant of a motion.
 
-    Parameters
-    ----------
-    reduction : Reduction
-        Of a program realised by actuators.
-    t : (N,) array
-        [s]
-    jets : (n_z, N) array
-    values : (n_p,) array
-        Parameters.
-
-    Returns
-    -------
-    list of Directions
+    For a program realised by actuators, at t (N,) [s] with jets (n_z, N) and parameters `values` (n_p,).
     """
     mechanism, q = reduction.mechanism, reduction.mechanism.q
     points = points_of(reduction, t, jets, values)
@@ -202,17 +190,8 @@ def directions(reduction, t, jets, values):
 def margins(reduction, t, jets, values):
     """Smallest equilibrated pivot of the leading matrix at each instant of a motion, (N,).
 
-    It is 0 where the matrix is singular, and NaN where it has no value.
-    Where it is regular, orders and zeros at infinity are those of the reduction.
-
-    Parameters
-    ----------
-    reduction : Reduction
-    t : (N,) array
-        [s]
-    jets : (n_z, N) array
-    values : (n_p,) array
-        Parameters.
+    It is 0 where the matrix is singular, and NaN where it has no value. Where it is regular, orders and zeros at
+    infinity are those of the reduction. The motion is t (N,) [s] with jets (n_z, N) and parameters `values` (n_p,).
     """
     t, jets = np.asarray(t, dtype=float), np.asarray(jets, dtype=float)
     numbers = clean(*points_of(reduction, t, jets, values).matrix(reduction.leading))
@@ -256,21 +235,9 @@ def _taking_part(names, combinations):
 def structure(reduction, t=None, jets=None, values=None, start=None):
     """Decide index, relative degrees, zeros at infinity and essential orders at points of a motion.
 
-    Parameters
-    ----------
-    reduction : Reduction
-    t : (N,) array, optional
-        Instants of a motion [s]; default: the seeded points of the reduction.
-    jets : (n_z, N) array, optional
-        q, γ', ..., γ^(s̄) there.
-    values : (n_p,) array, optional
-        Parameters.
-    start : (float, (n_x,) array), optional
-        A time [s] and a state at which the structure is decided as well.
-
-    Returns
-    -------
-    Structure
+    The points are instants t (N,) [s] with jets q, γ', ..., γ^(s̄) (n_z, N) and parameters `values` (n_p,); by default
+    the seeded points of the reduction. `start` is a time [s] and a state (n_x,) at which the structure is decided as
+    well.
     """
     names = tuple(reduction.program.residuals)
     orders = [reduction.original[name].order for name in names]

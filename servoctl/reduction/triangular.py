@@ -26,22 +26,8 @@ DIGITS = 10  # decimal digits of the weights of rows
 def completed(q, rows, context, starts):
     """Rows with their hidden constraints, by blocks where the expression of a row would hold high derivatives.
 
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-        n rows, as for `hidden.complete`, whose results come first.
-    context : Context
-    starts : Points
-
-    Returns
-    -------
-    rows : list of Row
-    rank : Rank
-    points : Points
-    pivots : list of (str, SX)
-    cascade : Cascade or None
-        None where rows have no such form, or no high derivatives.
+    Takes n rows, and returns what `hidden.complete` does, followed by the cascade: None where rows have no such form,
+    or no high derivatives.
     """
     try:
         return *complete(q, rows, context, starts, most=SHALLOW), None
@@ -165,15 +151,7 @@ def _determines(q, block):
 def triangular(q, rows):
     """Rows and the quasi-velocities in them as blocks, each square, in which later ones do not occur in earlier rows.
 
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-
-    Returns
-    -------
-    list of Block
-        Empty where rows cannot be matched with quasi-velocities, and these with coordinates.
+    Empty where rows cannot be matched with quasi-velocities, and these with coordinates.
     """
     moved_by = _moved_by(q)
     contents = [_contents(q, row, moved_by) for row in rows]
@@ -195,15 +173,6 @@ def recombined(q, rows):
     """Rows of which constant combinations replace some, where these hold rates of coordinates known before alone.
 
     Balances of joint coordinates, or of velocities between bodies, are sums of those of single bodies.
-
-    Parameters
-    ----------
-    q : Coordinates
-    rows : list of Row
-
-    Returns
-    -------
-    list of Row
     """
     slopes, rows, known, left = _slopes_anywhere(q, rows), list(rows), set(), list(range(len(rows)))
     while left:

@@ -105,13 +105,8 @@ def _coinciding(name, offset, rotation, kind):
 def _without_followers(rows, q, parameters, at):
     """The rows without those that depend on rows before them wherever all of them vanish.
 
-    Parameters
-    ----------
-    rows : dict of str to SX
-    q : Coordinates
-    parameters : Parameters or None
-    at : (nq,) array or None
-        A posture in which all rows vanish, where one is known.
+    `at` (nq,) is a posture in which all rows vanish, None where none is known. Rows that contradict each other are
+    refused, and so are rows of which none changes with the posture.
     """
     symbols = ca.vertcat(*q, *((parameters.symbols) if parameters else ()))
     values = ca.vertcat(*rows.values())

@@ -72,14 +72,8 @@ class Description:
 def described(source):
     """The description of a robot from the path of a URDF file, or from its text.
 
-    Parameters
-    ----------
-    source : str, bytes or Path
-
-    Raises
-    ------
-    SpecificationError
-        If the file is no URDF, is too large, has a document type, entities or xacro, or numbers that are none.
+    Refused: a file that is no URDF or is too large, one with a document type, entities or xacro, and numbers that are
+    none.
     """
     root = _root_element(*_bytes(source))
     if root.tag != "robot":

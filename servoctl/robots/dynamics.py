@@ -21,16 +21,10 @@ class Axis:
 
 
 class Kinematics:
-    """Rotation and offset of each body in its parent, and its rates; all vectors in the body's own axes.
+    """Rotations and offsets of the bodies in the world, and their velocities in their own axes.
 
-    Attributes
-    ----------
-    rotations, offsets : list of (3, 3) and (3,) SX
-        Of the bodies in the world.
-    omega : list of (3,) SX
-        Angular velocities [rad/s].
-    speed : list of (3,) SX
-        Velocities of the origins [m/s].
+    One entry for each body, SX: `rotations` (3, 3), `offsets` (3,) [m], angular velocities `omega` (3,) [rad/s], and
+    velocities `speed` (3,) of the origins [m/s].
     """
 
     def __init__(self, tree, axes):

@@ -21,12 +21,7 @@ UNITS = {"turn": ["rad"], "slide": ["m"], "free": ["m"] * 3 + ["1"] * 4}  # of c
 def axes_of(description, tree, taken):
     """Coordinates of a tree, the axis of each body, and the joints of the file by coordinate.
 
-    Parameters
-    ----------
-    description : Description
-    tree : Tree
-    taken : sequence of str
-        Names that no coordinate has.
+    No coordinate gets a name that is in `taken`.
     """
     free, taken = any(body.motion == "free" for body in tree.bodies), set(taken)
     places, joints, sources = {}, {}, {}
@@ -123,12 +118,7 @@ def _with_twists(q, tree, places):
 def identifier(name, taken=(), names_of=lambda name: (name,)):
     """A name as a Python identifier that neither a coordinate nor a derivative of one has.
 
-    Parameters
-    ----------
-    name : str
-    taken : set of str
-    names_of : callable
-        Names that come with a name.
+    Names in `taken` and of their derivatives are avoided, also by the names that come with it, which `names_of` gives.
     """
     plain = re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))
     plain = f"j_{plain}" if not plain.isidentifier() or keyword.iskeyword(plain) or plain in ARGUMENTS else plain

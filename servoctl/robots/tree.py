@@ -56,19 +56,8 @@ class Tree:
 def tree(description, base, lock, inertials):
     """The tree of bodies of a description.
 
-    Parameters
-    ----------
-    description : Description
-    base : "fixed" or "free"
-    lock : dict of str to float
-        Positions of joints that are held fixed [rad or m].
-    inertials : dict of str to Inertial
-        Of the links, some with symbols.
-
-    Raises
-    ------
-    SpecificationError
-        If links have no root, several, or form a loop.
+    `base` is "fixed" or "free", `lock` has the positions of joints that are held fixed [rad or m], and `inertials`
+    those of the links, some with symbols. Links without a root, with several, or in a loop are refused.
     """
     bodies, places = [], {}
     root = _root_link(description)
@@ -93,12 +82,8 @@ def tree(description, base, lock, inertials):
 def with_followers(description, lock):
     """The description in which joints mimic joints that move, and the locked joints with those that follow them.
 
-    Raises
-    ------
-    SpecificationError
-        If a joint is locked that is fixed, or joints mimic each other, or one that has several positions.
-    NameUnknown
-        If a locked joint does not exist.
+    `lock` has positions by joint [rad or m]. Refused: a lock of a joint that does not exist, is fixed or has several
+    positions, and joints that mimic each other, or one that has several positions.
     """
     for name in lock:
         if name not in description.joints:

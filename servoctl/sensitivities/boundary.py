@@ -22,17 +22,7 @@ SAME_MOTION = 1e-3  # of its size: a run that differs by more is not the bounded
 def bounded_tangent(model, run, names):
     """The tangent (n_x, k, N) of the state of a bounded run by parameters.
 
-    Parameters
-    ----------
-    model : Model
-    run : Run
-    names : tuple of str
-        Of the parameters.
-
-    Raises
-    ------
-    SpecificationError
-        If the samples do not determine the window of the motion.
+    Refused if the samples do not determine the window of the motion.
     """
     problem, mesh, x = _recomputed(model, run)
     at_nodes = _Linear(problem, names, problem._nodes(mesh), x)

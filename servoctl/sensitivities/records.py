@@ -19,32 +19,15 @@ GAP = 1.5  # median intervals, beyond which samples are missing
 
 @frozen
 class Record:
-    """One measured run, or a piece of it.
+    """One measured run, or a piece of it."""
 
-    Attributes
-    ----------
-    t : (N,) array
-        [s]
-    inputs : (m, N) array
-        That act from each sample on.
-    held : (m, (N - 1) substeps) array
-        Inputs in each integration step.
-    measured : dict of str to (N,) array
-    substeps : int
-        Runge-Kutta steps between two samples.
-    step : float
-        Their length [s].
-    states : (n_x, N) array
-        Guesses of the states.
-    """
-
-    t: np.ndarray
-    inputs: np.ndarray
-    held: np.ndarray
-    measured: dict
-    substeps: int
-    step: float
-    states: np.ndarray
+    t: np.ndarray  # (N,) [s]
+    inputs: np.ndarray  # (m, N) that act from each sample on
+    held: np.ndarray  # (m, (N - 1) substeps), inputs in each integration step
+    measured: dict  # (N,) arrays by name
+    substeps: int  # Runge-Kutta steps between two samples
+    step: float  # their length [s]
+    states: np.ndarray  # (n_x, N) guesses
 
     def pieces(self, count):
         """The record cut into at most `count` pieces, each with a first state of its own: (first sample, piece)."""

@@ -34,18 +34,8 @@ def start_of(run):
 class Tangent:
     """The tangent of the jets Z = (q, γ', ..., γ^(s̄)) of a model in the direction of its parameters.
 
-    Parameters
-    ----------
-    equations : Equations
-    names : sequence of str
-        Of the k parameters.
-    S : (n_x, K) SX, optional
-        Tangent of the state, its first k columns by the parameters; default: as the program determines it.
-
-    Attributes
-    ----------
-    jets : (n_z, K) SX
-        ∂Z by parameters, then by initial values.
+    `S` (n_x, K) is the tangent of the state, its first k columns by the k parameters `names`, the others by initial
+    values; by default it is what the program determines. `jets` (n_z, K) is ∂Z with the same columns.
     """
 
     def __init__(self, equations, names, S=None):
@@ -108,15 +98,7 @@ def determined(model, names, kinds):
 def along_state(model, names, initial, kinds):
     """The tangent of jets and signals at a state and its tangent S: a function of t, (Z, S), p.
 
-    Parameters
-    ----------
-    model : Model
-    names : tuple of str
-        Of the parameters.
-    initial : int
-        Number of initial values, whose columns of S follow those of the parameters.
-    kinds : tuple of str
-        Groups of signals.
+    The columns of S are by the parameters `names`, then by `initial` initial values; `kinds` are groups of signals.
     """
 
     def build():

@@ -30,15 +30,7 @@ pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: 13px; } 
 def write_page(folder, facts, units, verification, report, motion):
     """Write index.html from the facts of summary.json, the report and the pictures in the folder.
 
-    Parameters
-    ----------
-    folder : Path
-    facts : dict
-    units : dict of str to str
-    verification : Verification or None
-    report : str
-    motion : str
-        HTML of the mechanism in motion, or "".
+    `verification` may be None; `report` is a text, `motion` HTML of the mechanism in motion, or "".
     """
     scene, command = facts["scene"], shlex.join(["servoctl", *facts["command"]])
     parts = [

@@ -16,11 +16,8 @@ _MODULE = "servoctl_scene"  # name of the module made from a user's file, so tha
 def find_scene(given):
     """The name and the scene of a gallery name or of a user's file; errors in the file are reported with their line.
 
-    Parameters
-    ----------
-    given : str
-        A name of the gallery, or the path of a .py file that defines `scene()` -> (Mechanism, Program), and optionally
-        START, GUESS, T_SPAN and UNITS (see `servoctl.gallery`). The first line of its docstring is the description.
+    The file is a .py file that defines `scene()` -> (Mechanism, Program), and optionally START, GUESS, T_SPAN and UNITS
+    (see `servoctl.gallery`). The first line of its docstring is the description.
     """
     from servoctl.gallery import gallery
 

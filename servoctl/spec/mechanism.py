@@ -685,12 +685,7 @@ def inverse_directions(E):
 
 
 def require_known(expression, mechanism, what):
-    """Refuse a symbol that is no coordinate, jet, parameter or t of the mechanism.
-
-    Raises
-    ------
-    SpecificationError
-    """
+    """Refuse a symbol that is no coordinate, jet, parameter or t of the mechanism."""
     q, known = mechanism.q, {s.element_hash() for s in mechanism.parameters.symbols}
     for s in ca.symvar(expression):
         if q.where(s) is None and s.element_hash() not in known:

@@ -27,25 +27,11 @@ class Packed:
 
 
 def packed(value, q, parameters, shared=None):
-    """A value with expressions as a function and bytes, which pickle.
+    """A value with expressions as a function, whose outputs they are, and bytes with everything else; both pickle.
 
-    Parameters
-    ----------
-    value : object
-        It may hold SX expressions at any depth. A dataclass is packed as those fields of its constructor that count
-        for its equality; cached fields are computed again.
-    q : Coordinates
-    parameters : Parameters
-        Symbols of the expressions beside those of q.
-    shared : dict of str to object, optional
-        Objects by name, beside q, that are referred to and not packed.
-
-    Returns
-    -------
-    function : casadi.Function
-        Its outputs are the expressions.
-    content : bytes
-        Everything else.
+    The value may hold SX expressions at any depth, in the symbols of q and of the parameters. A dataclass is packed as
+    those fields of its constructor that count for its equality; cached fields are computed again. Objects in `shared`,
+    by name, are referred to, as q is, and not packed.
     """
     stream = io.BytesIO()
     pickler = _Pickler(stream, {"q": q, **(shared or {})})
@@ -56,11 +42,7 @@ def packed(value, q, parameters, shared=None):
 def unpacked(content, q, parameters, shared=None):
     """The value that was `packed`, in the symbols of q and the parameters.
 
-    Parameters
-    ----------
-    content : (casadi.Function, bytes)
-    q, parameters, shared
-        As in `packed`, perhaps of another process.
+    `content` is the pair that `packed` returned; q, the parameters and `shared` may be those of another process.
     """
     function, rest = content
     unpickler = _Unpickler(io.BytesIO(rest))

@@ -133,22 +133,7 @@ def as_shapes(shapes, known):
 
 
 def moved(mechanism, t, q, p):
-    """Where the shapes are.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-    t : (N,) array
-        [s]
-    q : (nq, N) array
-    p : (n_p,) array
-        Parameters of the mechanism.
-
-    Returns
-    -------
-    dict of str to (d, n, N) array
-        [m]
-    """
+    """Points of the shapes by name, (d, n, N) [m], at t (N,) [s], q (nq, N) and parameters p (n_p,)."""
     values = np.array(_points_of(Identity(mechanism))(np.reshape(t, (1, -1)), q, p))
     ends = np.cumsum([points.numel() for points in mechanism.shapes.values()])
     rows = np.split(values, ends[:-1])
@@ -169,18 +154,8 @@ def _points_of(identity):
 def heights(mechanism, names, t, q, p):
     """For each of some coordinates or outputs: 1 if it measures height, -1 if depth, 0 if neither is certain.
 
-    At rest, the balance of a mechanism under gravity is that of a force along one of them.
-
-    Parameters
-    ----------
-    mechanism : Mechanism
-    names : sequence of str
-        Of coordinates, or outputs without derivatives.
-    t, q, p : (N,), (nq, N), (n_p,) arrays
-
-    Returns
-    -------
-    list of int
+    At rest, the balance of a mechanism under gravity is that of a force along one of them. The instants are t (N,) with
+    q (nq, N) and p (n_p,). All are 0 if an output contains derivatives.
     """
     own = dict(zip(mechanism.q.names, mechanism.q, strict=True)) | mechanism.outputs
     if any(mechanism.q.order(own[name]) > 0 for name in names):

@@ -16,15 +16,8 @@ APPLIED = {
 def summands(expression, moves):
     """Terms of a scalar: operands of its sums and differences, also of those with a factor that does not move.
 
-    Parameters
-    ----------
-    expression : SX scalar
-    moves : callable
-        Whether an SX scalar depends on the motion.
-
-    Returns
-    -------
-    list of SX scalars
+    `moves` tells whether an SX scalar depends on the motion. The terms are without their signs and without such
+    factors.
     """
     terms, waiting = [], [expression]
     while waiting:

@@ -12,21 +12,9 @@ MOST_POINTS = 100_000  # of motions and instants at which signals are evaluated 
 class Signals(Mapping):
     """Signals of N motions at K instants, (K, N) arrays by the names that a `Run` of one motion has.
 
-    Parameters
-    ----------
-    model : Model
-    t : (K,) or (K + 1,) array
-        The instants, then the end of the motions if that is none of them [s].
-    count : int
-        K
-    states : (n_x, K, N) or (n_x, K + 1, N) array
-        At these; NaN for motions that ended early.
-    parameters : (n_p, N) array
-        SI.
-    level : int
-        Highest order of the jets.
-    runs : dict of int to Run
-        Motions that have models of their own, by their index.
+    `t` has the instants [s], then the end of the motions if that is none of them; `states` (n_x, K or K + 1, N) are
+    those at `t`, NaN for motions that ended early, and `parameters` are (n_p, N) in SI. `level` is the highest order of
+    the jets, and `runs` are motions that have models of their own, by index.
     """
 
     def __init__(self, model, t, count, states, parameters, level, runs):

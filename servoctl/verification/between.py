@@ -97,66 +97,33 @@ def _power_of_forces(model):
 class Integration:
     """How intervals are integrated.
 
-    Attributes
-    ----------
-    sizes : (n_x,) array
-        Of the components of the state.
-    limit : float
-        Largest difference from the next sample that passes, relative to the sizes.
-    steps : (K,) array of int
-        Steps of each interval, at least; at the ends of all steps but the last jets are returned.
-    work : (K,) array
-        Largest difference of the integrals of the power between two lengths of step.
+    Jets are returned at the ends of all steps of an interval but the last.
     """
 
-    sizes: np.ndarray
-    limit: float
-    steps: np.ndarray
-    work: np.ndarray
+    sizes: np.ndarray  # (n_x,) of the components of the state
+    limit: float  # largest difference from the next sample that passes, relative to the sizes
+    steps: np.ndarray  # (K,) of each interval, at least
+    work: np.ndarray  # (K,) largest difference of the integrals of the power between two lengths of step; inf: any
 
 
 @frozen
 class Interval:
-    """What was found in one or many intervals, one entry for each.
+    """What was found in one or many intervals, one entry for each."""
 
-    Attributes
-    ----------
-    ends : (n_x, K) array
-        States reached.
-    defects : (K,) array
-        Largest differences from the samples at the ends, relative to the sizes; NaN without such a sample.
-    resolved : (K,) array of bool
-        Whether the steps were short enough to decide.
-    work : (K,) array
-        Integrals of the power.
-    inside : list of (flow, t, z)
-        Instants inside and jets there, with the flow that led to them.
-    """
-
-    ends: np.ndarray
-    defects: np.ndarray
-    resolved: np.ndarray
-    work: np.ndarray
-    inside: list = field(default_factory=list)
+    ends: np.ndarray  # (n_x, K) states reached
+    defects: np.ndarray  # (K,) largest differences from the samples at the ends, relative to the sizes; NaN without one
+    resolved: np.ndarray  # (K,) whether the steps were short enough to decide
+    work: np.ndarray  # (K,) integrals of the power
+    inside: list = field(default_factory=list)  # of (flow, t, z): jets z at instants t inside, to which the flow led
 
 
 def between(attempts, t, x, settings):
     """Integrate from each edge to the next.
 
-    Parameters
-    ----------
-    attempts : sequence of callable
-        Of the indices (K,) of edges: pairs of a `Flow` and of the indices of those that it leads on. Each is tried
-        where those before it did not lead to the next edge, as pivots may vanish between edges.
-    t : (K + 1,) array
-        Edges, in the order of the motion [s].
-    x : (n_x, K + 1) array
-        States of the samples; NaN at edges between them, whose state is the one reached from the edge before.
-    settings : Integration
-
-    Returns
-    -------
-    Interval
+    Each of `attempts` maps indices (K,) of edges to pairs of a `Flow` and the indices of those that it leads on; it is
+    tried where those before it did not lead to the next edge, as pivots may vanish between edges. Edges t (K + 1,) [s]
+    are in the order of the motion; states x (n_x, K + 1) are NaN at edges between samples, where the state is the one
+    reached from the edge before.
     """
     count, budget, x = len(t) - 1, [MOST_OPERATIONS], x.copy()
     found = Interval(np.full((len(x), count), np.nan), *(np.full(count, v) for v in (np.nan, False, np.nan)))

@@ -20,14 +20,6 @@ def verify_loop(closed):
     disturbances and friction as one more state. The energy gained less this work is an integration error, which shrinks
     with the steps. A force that acts on the plant but is missing in the balance, or the other way round, leaves a
     defect that does not shrink.
-
-    Parameters
-    ----------
-    closed : Closed
-
-    Returns
-    -------
-    Verification
     """
     plant, found, limits, notes = closed.plant, {}, dict(LOOP_LIMITS), []
     _require_signals(closed)
