@@ -236,7 +236,7 @@ def _require_enough(mechanism, program, independent):
 
 
 def _require_choices(mechanism, program):
-    """Refuse unknown actuators, wishes of accelerations, and wishes where no actuation is open."""
+    """Refuse wishes of accelerations, wishes where no actuation is open, and an inertial metric that does not fit."""
     if program.metric == "inertia":
         _require_inertial(mechanism, program)
     for name, wish in program.toward.items():
