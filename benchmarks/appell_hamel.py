@@ -92,7 +92,7 @@ def simulated(order, rtol):
     model, start = constrained()
 
     def call():
-        method = sv.Taylor(order, rtol=rtol, atol=rtol)
+        method = sv.methods.Taylor(order, rtol=rtol, atol=rtol)
         run = sv.simulate(model, start, (0.0, DURATION), method, t_eval=SAMPLES, progress=False)
         return run.jets[:10, -1]
 

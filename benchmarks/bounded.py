@@ -1,7 +1,7 @@
 """Bounded motions of programs with unstable internal dynamics, from rest to rest.
 
-`sv.simulate` with `sv.Bounded()` against scipy's solve_bvp: on the functions of the model, called for one instant or
-for all instants at a time, and for the arm with a passive joint on its equations written by hand for NumPy. A peer
+`sv.simulate` with `sv.methods.Bounded()` against scipy's solve_bvp: on the functions of the model, called for one
+instant or for all instants at a time, and for the arm with a passive joint on its equations written by hand for NumPy. A peer
 solves for the free entries of the state that we chose for it, with the eigenvectors at rest as its boundary rows and
 our tolerance.
 """
@@ -18,7 +18,7 @@ from servoctl.gallery import gallery
 M, L, I, C, D, GAMMA = 6.875, 1.0, 0.57, 50.0, 0.25, 0.5  # kg, m, kg m^2, N m/rad, N m s/rad, 1
 WINDOW = 15.0  # time constants before and after the path for solve_bvp
 WITHIN = 1e-9  # rad, at the known values and at all instants
-TOLERANCE = sv.Bounded().rtol  # 1e-9; peers are right from 1e-7 on, in a third to a half of the time
+TOLERANCE = sv.methods.Bounded().rtol  # 1e-9; peers are right from 1e-7 on, in a third to a half of the time
 ONE, ALL, HAND = (f"scipy solve_bvp, {on}" for on in ("model by instants", "model by arrays", "NumPy by hand"))
 
 
@@ -49,7 +49,7 @@ def aircraft():
 def motion(scene, tolerance=None):
     """The free angle at the instants, by the toolkit."""
     model, duration, name, _ = scene
-    start, method = model.start(), sv.Bounded() if tolerance is None else sv.Bounded(rtol=tolerance)
+    start, method = model.start(), sv.methods.Bounded() if tolerance is None else sv.methods.Bounded(rtol=tolerance)
     return lambda: sv.simulate(model, start, (0.0, duration), method, t_eval=instants(duration))[name]
 
 

@@ -83,7 +83,7 @@ def simulated(last, rtol):
     columns = [f"final {name}" for name in (*NAMES, "dphi", "dtheta")]
 
     def call():
-        method = sv.Taylor(last - 1, rtol=rtol, atol=rtol)
+        method = sv.methods.Taylor(last - 1, rtol=rtol, atol=rtol)
         many = sv.simulate_many(model, start, masses(), (0.0, DURATION), method, executor=1)
         return np.array([many[name] for name in columns])
 

@@ -52,7 +52,8 @@ def internal(app, what, name, thing, skip, options):
         return None if public and "----" in (thing.__doc__ or "") else True
     if skip or what != "class" or not inspect.isfunction(function):
         return None
-    owner = getattr(servoctl, function.__qualname__.split(".")[0], None)
+    first = function.__qualname__.split(".")[0]
+    owner = next((getattr(home, first) for home in (servoctl, servoctl.types) if hasattr(home, first)), None)
     known = re.search(rf"\.{name}\b", USED) or f"`{name}`" in (owner.__doc__ or "")
     return None if function.__annotations__ or known else True
 

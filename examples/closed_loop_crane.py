@@ -70,7 +70,7 @@ def refusal(mechanism, plan, time_constant=0.015):
     """The error raised for poles that are too fast for 100 Hz."""
     try:
         sv.computed(plan, sv.plant(mechanism), poles=time_constant)
-    except sv.SpecificationError as error:
+    except sv.errors.SpecificationError as error:
         return error
     raise AssertionError("poles beyond the bound were accepted")
 

@@ -114,7 +114,7 @@ def pendubot_upright():
     try:
         sv.computed(plan, nominal)
         refused = False
-    except sv.UnstableInternalDynamics as error:
+    except sv.errors.UnstableInternalDynamics as error:
         print(error)
         refused = "lqr" in str(error)
     machine = sv.plant(nominal.mechanism, m2=3.3, d=0.1)

@@ -8,6 +8,17 @@ import re
 import sys
 import warnings
 
+__all__ = [
+    "InconsistentStart",
+    "IntegrationStopped",
+    "LimitExceeded",
+    "NameUnknown",
+    "NotRealisable",
+    "ServoError",
+    "SingularProgram",
+    "SpecificationError",
+    "UnstableInternalDynamics",
+]
 DERIVATIVE = re.compile(r"d([2-9]?)([A-Za-z_]\w*)")  # dx, d2x: names that may be those of derivatives
 
 

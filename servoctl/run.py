@@ -127,7 +127,7 @@ class Run(Sampled, Value):
 
     `run["theta"]`, `run["dtheta"]`, `run["trolley"]` are (N,) arrays, SI. Time derivatives of an actuation, output or
     energy are `run["dtrolley"]`, `run["d2trolley"]`; they may need higher jets, from `simulate(...,
-    method=sv.Taylor(jets=3))`. `run.residual["X"]` is (levels, N): the residual and its derivatives.
+    method=sv.methods.Taylor(jets=3))`. `run.residual["X"]` is (levels, N): the residual and its derivatives.
 
     Attributes
     ----------
@@ -271,7 +271,7 @@ class Run(Sampled, Value):
                 raise SpecificationError(
                     f"The run has jets up to order {present}, too few for {', '.join(names)}.",
                     f"These time derivatives follow from jets up to order {needed}.",
-                    do=f"Simulate with method=sv.Taylor(jets={needed}).",
+                    do=f"Simulate with method=sv.methods.Taylor(jets={needed}).",
                     names=names,
                     jets=needed,
                 )

@@ -91,8 +91,8 @@ def simulate(
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
     method : Algebraic, Taylor, RadauIIA, RungeKutta, Adaptive, or a short form, optional
-        A method with its settings, such as `sv.Taylor(jets=3)` or `sv.RungeKutta(4, step=1e-3)`, or the short form of
-        a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK4", "RK8", or scipy's names.
+        A method with its settings, such as `sv.methods.Taylor(jets=3)` or `sv.methods.RungeKutta(4, step=1e-3)`, or the
+        short form of a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK4", "RK8", or scipy's names.
         Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
         Σ o_a = 0, else "Taylor", or "RadauIIA" where stability limits its steps; "DOP853" with the treatments of drift
         that series exclude, and for equations so large that making a series takes seconds.
@@ -100,8 +100,8 @@ def simulate(
         Treatment of constraint drift. A number is the time constant of the error dynamics [s].
     accuracy : float, optional
         Largest error of the motion, relative to each component's size. It determines method and drift
-        (`servoctl.methods.accuracy`), and the error is measured. Only `method=sv.Taylor(jets=3)` may be combined
-        with it, for jets.
+        (`servoctl.methods.accuracy`), and the error is measured. Only `method=sv.methods.Taylor(jets=3)` may be
+        combined with it, for jets.
 
     Other arguments
 

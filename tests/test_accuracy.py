@@ -30,7 +30,7 @@ def independent(gallery_model):
             model, scene = gallery_model(name), gallery[name]
             start = model.start(t=scene.t_span[0], guess=scene.guess, **scene.start)
             run = sv.simulate(
-                model, start, scene.t_span, sv.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=times(scene)
+                model, start, scene.t_span, sv.methods.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=times(scene)
             )
             found[name] = (model, start, run)
         return found[name]
@@ -49,7 +49,7 @@ def test_the_motion_is_as_accurate_as_asked(name, accuracy, independent):
     assert run.method == "Taylor" and "two tolerances agree" in run.message
     assert rule.motion_error(model, run.jets, exact.jets) <= accuracy
     coarse = sv.simulate(
-        model, start, gallery[name].t_span, sv.Adaptive("RK45", rtol=1e-2, atol=1e-2), t_eval=times(gallery[name])
+        model, start, gallery[name].t_span, sv.methods.Adaptive("RK45", rtol=1e-2, atol=1e-2), t_eval=times(gallery[name])
     )
     assert rule.motion_error(model, coarse.jets, exact.jets) > 1e-9  # the measure tells a coarse motion
 
@@ -80,7 +80,7 @@ def test_jets_and_samples_go_with_an_accuracy(gallery_model):
         model,
         model.start(guess=scene.guess, **scene.start),
         (0.0, 0.5),
-        sv.Taylor(jets=4),
+        sv.methods.Taylor(jets=4),
         accuracy=1e-6,
         t_eval=[0.5],
     )
@@ -91,9 +91,9 @@ def test_jets_and_samples_go_with_an_accuracy(gallery_model):
     "given",
     [
         {"method": "RK4"},
-        {"method": sv.Taylor()},
-        {"method": sv.Taylor(8, jets=3)},
-        {"method": sv.Taylor(rtol=1e-6)},
+        {"method": sv.methods.Taylor()},
+        {"method": sv.methods.Taylor(8, jets=3)},
+        {"method": sv.methods.Taylor(rtol=1e-6)},
         {"drift": "project"},
     ],
     ids=str,
@@ -216,7 +216,7 @@ def test_stiff_motions_are_integrated_implicitly(damping, stiffness, end, method
     assert np.abs(plain["y"] - expected).max() <= 1e-6 * np.abs(expected).max()
     if method == "RadauIIA":
         assert "stability, not accuracy, limits the steps of Taylor" in plain.message
-        explicit = sv.simulate(model, run.state(0.0), (0.0, end), sv.Taylor(rtol=1e-9, atol=1e-9), drift="project")
+        explicit = sv.simulate(model, run.state(0.0), (0.0, end), sv.methods.Taylor(rtol=1e-9, atol=1e-9), drift="project")
         assert explicit.counters["steps"] > 10 * run.counters["steps"]
 
 

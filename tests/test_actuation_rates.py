@@ -13,7 +13,7 @@ def taylor(gallery_model, name, t0, t1, jets):
     """A run of a scene from its own start, with samples between two times within one smooth piece."""
     model, scene = gallery_model(name), gallery[name]
     start = model.start(guess=scene.guess, **scene.start)
-    method = sv.Taylor(jets=jets, rtol=1e-13, atol=1e-14)
+    method = sv.methods.Taylor(jets=jets, rtol=1e-13, atol=1e-14)
     return sv.simulate(model, start, (0.0, t1), method, drift="project", t_eval=np.linspace(t0, t1, 201))
 
 
@@ -40,7 +40,7 @@ def test_rates_across_a_change_of_pivots(gallery_model):
     model = gallery_model("constant-speed")
     scene = gallery["constant-speed"]
     start = model.start(guess=scene.guess, **scene.start)
-    run = sv.simulate(model, start, (0.0, 2.0), method=sv.Taylor(jets=model.reduction.top + 1), drift="project")
+    run = sv.simulate(model, start, (0.0, 2.0), method=sv.methods.Taylor(jets=model.reduction.top + 1), drift="project")
     signal = next(iter(model.signal_groups))
     slope = make_interp_spline(run.t, run[signal], k=5)(run.t, nu=1)
     assert run[f"d{signal}"] == pytest.approx(slope, abs=1e-5 * (1 + np.abs(slope).max()))
@@ -50,7 +50,7 @@ def test_rates_across_a_change_of_pivots(gallery_model):
 def test_a_run_without_the_jets_says_how_to_get_them(method, gallery_model):
     model = gallery_model("overhead-crane")
     run = sv.simulate(model, model.start(), (0.0, 1.0), method=method, t_eval=[0.0, 1.0])
-    with refused(sv.SpecificationError, jets=3) as caught:
+    with refused(sv.errors.SpecificationError, jets=3) as caught:
         run["dtrolley"]
     assert caught.value.details["jets"] == 3
 
@@ -59,5 +59,5 @@ def test_a_run_without_the_jets_says_how_to_get_them(method, gallery_model):
 def test_names_that_are_no_rates(name, gallery_model):
     model = gallery_model("overhead-crane")
     run = sv.simulate(model, model.start(), (0.0, 1.0), t_eval=[0.0, 1.0])
-    with pytest.raises(sv.NameUnknown):
+    with pytest.raises(sv.errors.NameUnknown):
         run[name]

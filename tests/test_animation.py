@@ -159,7 +159,7 @@ def test_depth_is_drawn_downwards(gallery_model):
     for name, axes in (("overhead-crane", ("X [m]", "Z [m]")), ("crane-3d", ("X [m]", "Z [m]"))):
         model, scene = gallery_model(name), gallery[name]
         run = sv.simulate(model, model.start(guess=scene.guess), (0.0, 3.0), t_eval=[0.0, 1.5, 3.0])
-        ax = sv.plots.path(run)
+        ax = sv.figures.path(run)
         assert (ax.get_xlabel(), ax.get_ylabel()) == axes and ax.yaxis_inverted()
 
 
@@ -185,7 +185,7 @@ def test_height_is_what_weight_acts_along(rest, signs):
 
 
 def test_an_animation_shows_the_motion(crane):
-    shown = sv.plots.animate(crane, fps=20)
+    shown = sv.figures.animate(crane, fps=20)
     assert (len(shown.t), shown.pace, shown.space) == (41, 0.5, False)  # a second, shown in two
     assert "slowed down 2 times" in repr(shown)
     assert shown.shapes["load"] == pytest.approx(np.array([crane["X"], -crane["Z"]]), abs=1e-9)
@@ -193,14 +193,14 @@ def test_an_animation_shows_the_motion(crane):
     assert shown.trails["load"] is not shown.shapes["load"] and list(shown.trails) == ["load"]
     X, height = shown.programmed["load"]
     assert height == pytest.approx(-4 + 2 * X / 5, abs=1e-9)
-    assert list(sv.plots.animate(crane, trail=["trolley", "load"]).trails) == ["trolley", "load"]
-    assert sv.plots.animate(crane, trail=()).programmed == {}
-    middle = sv.plots.animate(crane, fps=20, trail="trolley").trails["trolley"]
+    assert list(sv.figures.animate(crane, trail=["trolley", "load"]).trails) == ["trolley", "load"]
+    assert sv.figures.animate(crane, trail=()).programmed == {}
+    middle = sv.figures.animate(crane, fps=20, trail="trolley").trails["trolley"]
     assert middle == pytest.approx(np.array([crane["x"], 0 * crane["x"]]), abs=1e-9)  # of a body
 
 
 def test_the_path_of_a_loop_lies_over_that_of_its_plan(crane, loop):
-    shown = sv.plots.animate(loop, fps=25)
+    shown = sv.figures.animate(loop, fps=25)
     assert shown.trails["load"] == pytest.approx(np.array([loop["X"], -loop["Z"]]), abs=1e-9)
     X, height = shown.programmed["load"]
     assert height == pytest.approx(-4 + 2 * X / 5, abs=1e-6)
@@ -208,7 +208,7 @@ def test_the_path_of_a_loop_lies_over_that_of_its_plan(crane, loop):
 
 
 def test_a_file_has_the_frames_and_the_load_rises(crane, tmp_path):
-    path = sv.plots.animate(crane, fps=10).save(tmp_path / "crane")
+    path = sv.figures.animate(crane, fps=10).save(tmp_path / "crane")
     assert path.name == "crane.gif"
     picture = Image.open(path)
     assert (picture.n_frames, picture.info["loop"], picture.info["duration"]) == (21, 0, 100)
@@ -218,13 +218,13 @@ def test_a_file_has_the_frames_and_the_load_rises(crane, tmp_path):
         red, _, blue = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), -1, 0)
         lines.append(np.nonzero(red - blue > 120)[0].min())
     assert lines[1] < lines[0]  # rows of pixels count downwards
-    html = sv.plots.animate(crane, fps=1)._repr_html_()
+    html = sv.figures.animate(crane, fps=1)._repr_html_()
     assert html.startswith("<img ") and "data:image/gif;base64," in html
 
 
 def test_a_long_motion_is_shown_faster(crane):
     fps, run = 50, sv.simulate(crane.model, crane.start, (0.0, 40.0), t_eval=np.linspace(0.0, 40.0, 401))
-    shown = sv.plots.animate(run, fps=fps)
+    shown = sv.figures.animate(run, fps=fps)
     assert len(shown.t) == MOST_FRAMES and shown.pace == pytest.approx(40 * fps / (MOST_FRAMES - 1))
     assert "times as fast" in repr(shown)
     assert next(shown._frames()).shape[-1] == 3  # the clock of a frame says so as well
@@ -260,7 +260,7 @@ def points_of(text):
 
 
 def test_a_page_moves_the_lines_by_its_script(crane, tmp_path):
-    shown = sv.plots.animate(crane, fps=10)
+    shown = sv.figures.animate(crane, fps=10)
     page = shown.save(tmp_path / "crane.html").read_text(encoding="utf-8")
     assert not re.search("href|https?://|src=", page)
     drawing = ET.fromstring(re.search("<svg.*?</svg>", page, re.S)[0])
@@ -276,7 +276,7 @@ def test_a_page_moves_the_lines_by_its_script(crane, tmp_path):
 
 
 def test_a_page_of_many_points_leaves_frames_out(crane, monkeypatch):
-    shown = sv.plots.animate(crane, fps=40)
+    shown = sv.figures.animate(crane, fps=40)
     whole, t = shown.html(), shown.t
     monkeypatch.setattr(page_motion, "MOST_POINTS", 40 * 10)
     data = json.loads(re.search('<script type="application/json">(.*?)</script>', shown.html())[1])
@@ -289,7 +289,7 @@ def test_a_page_of_many_points_leaves_frames_out(crane, monkeypatch):
 def test_bodies_lie_below_lines_and_lines_below_dots_in_a_page(name, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), (0.0, 0.2), t_eval=np.linspace(0.0, 0.2, 5))
-    drawing = ET.fromstring(re.search("<svg.*?</svg>", sv.plots.animate(run).html(), re.S)[0])
+    drawing = ET.fromstring(re.search("<svg.*?</svg>", sv.figures.animate(run).html(), re.S)[0])
     looks = ["body" if line.get("fill") != "none" else "dot" if line.get("stroke") == style.COLOURS[1] else "line"
              for line in drawing.findall("polyline") if line.get("class") == "moving"]  # fmt: skip
     assert looks == sorted(looks, key=["body", "line", "dot"].index) and looks
@@ -297,7 +297,7 @@ def test_bodies_lie_below_lines_and_lines_below_dots_in_a_page(name, gallery_mod
 
 
 def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):
-    shown = sv.plots.animate(crane, fps=1)
+    shown = sv.figures.animate(crane, fps=1)
     monkeypatch.setenv("PATH", str(tmp_path))
     with refused(ServoError, "ffmpeg"):
         shown.save(tmp_path / "crane.mp4")
@@ -316,7 +316,7 @@ def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):
 def test_a_spatial_mechanism_is_projected_with_up_up(gallery_model):
     model, scene = gallery_model("crane-3d"), gallery["crane-3d"]
     run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span, t_eval=np.linspace(*scene.t_span, 25))
-    shown = sv.plots.animate(run, fps=4)
+    shown = sv.figures.animate(run, fps=4)
     assert shown.space and shown.shapes["load"][1, -1] > shown.shapes["load"][1, 0]  # it is lifted
     assert len(Image.open(io.BytesIO(shown.gif())).getbbox()) == 4
 
@@ -328,21 +328,21 @@ def test_a_mechanism_without_shapes_is_shown_by_its_positions():
         q, gibbs=sv.particle(q, p.m, ca.vertcat(x, z)), potential=-p.m * p.g * z, actuators={"a": x, "b": z}, parameters=p
     )
     model = sv.derive(mechanism, sv.Program({"X": x - q.t, "Z": z - q.t**2}, by="actuators"))
-    shown = sv.plots.animate(sv.simulate(model, model.start(), (0.0, 1.0)), fps=10)
+    shown = sv.figures.animate(sv.simulate(model, model.start(), (0.0, 1.0)), fps=10)
     assert shown.shapes["x, z"] == pytest.approx(np.array([shown.t, -(shown.t**2)]), abs=1e-6)
 
 
 def test_poses_are_drawn_at_instants(crane, gallery_model):
-    ax = sv.plots.stroboscope(crane, poses=4, title="crane")
+    ax = sv.figures.stroboscope(crane, poses=4, title="crane")
     assert ax.get_title() == "crane" and ax.get_aspect() == 1.0
     dots = [line for line in ax.get_lines() if line.get_marker() == "o"]
     places = np.array([line.get_xydata()[0] for line in dots])
     expected = [[crane["X"][k], -crane["Z"][k]] for k in (0, -1)]
     assert len(dots) == 4 and places[[0, -1]] == pytest.approx(np.array(expected), abs=1e-9)
-    assert sv.plots.stroboscope(crane, poses=1) is not None
+    assert sv.figures.stroboscope(crane, poses=1) is not None
     model = gallery_model("two-cars")
     run = sv.simulate(model, model.start(), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, 21))
-    ax = sv.plots.stroboscope(run, poses=5)  # on one line: one below the other
+    ax = sv.figures.stroboscope(run, poses=5)  # on one line: one below the other
     assert [label.get_text() for label in ax.get_yticklabels()] == ["0", "0.5", "1", "1.5", "2"]
     assert (np.diff(ax.get_yticks()) < 0).all() and ax.get_ylabel() == "t [s]"
 
@@ -358,7 +358,7 @@ def test_poses_that_would_hide_each_other_are_side_by_side(reach, apart):
     program = sv.Program({"turns": turn - np.pi * q.t, "goes": x - reach * q.t}, by="actuators")
     model = sv.derive(mechanism, program)
     run = sv.simulate(model, model.start(), (0.0, 1.0))
-    ax = sv.plots.stroboscope(run, poses=5)
+    ax = sv.figures.stroboscope(run, poses=5)
     instants = [entry for entry in ax.texts if entry.get_text().endswith(" s")]
     assert [entry.get_text() for entry in instants] == (["0 s", "0.25 s", "0.5 s", "0.75 s", "1 s"] if apart else [])
     if apart:  # three in the first row, two below them
@@ -370,24 +370,24 @@ def test_poses_that_would_hide_each_other_are_side_by_side(reach, apart):
 def test_what_cannot_be_animated_is_refused(crane, loop, tmp_path):
     for fps in (0.5, 1000, np.nan, "fast"):
         with refused(SpecificationError):
-            sv.plots.animate(crane, fps=fps)
+            sv.figures.animate(crane, fps=fps)
     with refused(NameUnknown, match="load"):
-        sv.plots.animate(crane, trail="lod")
+        sv.figures.animate(crane, trail="lod")
     with refused(SpecificationError, type="int"):
-        sv.plots.animate(3)
+        sv.figures.animate(3)
     loaded = sv.load(crane.save(tmp_path / "crane"))
     assert not shows_mechanism(loaded) and shows_mechanism(crane) and shows_mechanism(loop)
     with refused(SpecificationError, "sv.load(path, model)"):
-        sv.plots.animate(loaded)
+        sv.figures.animate(loaded)
     with refused(SpecificationError, suffix=".webm"):
-        sv.plots.animate(crane, fps=1).save(tmp_path / "crane.webm")
+        sv.figures.animate(crane, fps=1).save(tmp_path / "crane.webm")
     q = sv.coordinates("a b")
     model = sv.derive(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, ca.vertcat(*q)), actuators={"u": q["a"], "v": q["b"]}),
                       sv.Program({"A": q["a"] - q.t, "B": q["b"]}, by="actuators"))  # fmt: skip
     run = sv.simulate(model, model.start(), (0.0, 0.1))
     assert not shows_mechanism(run)
     with refused(SpecificationError, "shapes=", coordinates=["a", "b"], outputs=[]):
-        sv.plots.animate(run)
+        sv.figures.animate(run)
 
 
 @pytest.mark.parametrize(("name", "base"), [("six_axis_arm", "fixed"), ("quadruped", "free"), ("scara", "fixed")])
@@ -413,12 +413,12 @@ def test_motions_of_every_kind_are_drawn(crane, loop, tmp_path):
         "without feedback": sv.close(loop.plant, sv.feedforward(crane, loop.plant, 50.0), crane.state(0.0), (0.0, 1.0)),
     }
     for name, run in runs.items():
-        shown = sv.plots.animate(run, fps=2)
+        shown = sv.figures.animate(run, fps=2)
         assert np.isfinite(shown.shapes["load"]).all(), name
-    assert sv.plots.animate(runs["two samples"], fps=40).trails["load"] == pytest.approx(
-        sv.plots.animate(crane, fps=40).trails["load"], abs=1e-3
+    assert sv.figures.animate(runs["two samples"], fps=40).trails["load"] == pytest.approx(
+        sv.figures.animate(crane, fps=40).trails["load"], abs=1e-3
     )  # by the polynomial between samples
-    still = sv.plots.animate(runs["one sample"], fps=2)
+    still = sv.figures.animate(runs["one sample"], fps=2)
     assert len(still.t) == 1 and Image.open(io.BytesIO(still.gif())).n_frames == 1
     copy = pickle.loads(pickle.dumps(still))
     assert copy == still

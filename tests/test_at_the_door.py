@@ -67,7 +67,7 @@ def test_the_least_change_of_a_start_is_that_of_its_masses():
 
 
 def test_a_start_that_projection_does_not_bring_to_the_constraint_is_refused(pendulum):
-    with refused(sv.InconsistentStart, "model.start", invariant="rod"):
+    with refused(sv.errors.InconsistentStart, "model.start", invariant="rod"):
         sv.simulate(pendulum, [0.0, 0.0, 0.0, 0.0], (0.0, 1.0), drift="project")
 
 
@@ -152,7 +152,7 @@ DOORS = {
     "points of a path": lambda v: sv.paths.spline(FREE.t, [0.0, 1.0, 2.0], [0.0, v, 1.0]),
     "gust": lambda v: GUST(v, 0.0, 1.0),
     "rate": lambda v: sv.Timing(rate=v),
-    "tolerance": lambda v: sv.Taylor(rtol=v),
+    "tolerance": lambda v: sv.methods.Taylor(rtol=v),
     "axes of a circle": lambda v: sv.paths.circle(FREE.t, (0.0, 0.0), 1.0, axes=v),
 }
 
@@ -160,7 +160,7 @@ DOORS = {
 @pytest.mark.parametrize("value", COMPLEX, ids=lambda v: type(v).__name__)
 @pytest.mark.parametrize("door", DOORS)
 def test_a_complex_number_is_refused(door, value):
-    with pytest.raises(sv.SpecificationError):
+    with pytest.raises(sv.errors.SpecificationError):
         DOORS[door](value)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import (
     InconsistentStart,
     NameUnknown,

@@ -175,7 +175,7 @@ def test_limits_that_no_inputs_keep_are_rows(plan):
     given, starts = (law, plan.state(0.0), (0.0, 0.5)), np.array([0.0, 0.0, 6.0, 0.0])
     many = sv.close_many(sv.close(plant, *given), {"dtheta": starts})
     x0 = dict(zip(plant.state_names, plan.state(0.0), strict=True)) | {"dtheta": 6.0}
-    with pytest.raises(sv.LimitExceeded) as caught:
+    with pytest.raises(sv.errors.LimitExceeded) as caught:
         sv.close(plant, law, x0, (0.0, 0.5))
     assert many["error"].tolist() == ["", "", "LimitExceeded", ""]
     assert many["message"][2] == str(caught.value) and np.isnan(many["final x"][2])
@@ -219,7 +219,7 @@ def test_lost_states_and_commands_are_dated_at_their_samples(plan):
     assert [many["error"][i] for i in (0, 2, 3, 4)] == ["", "ServoError", "IntegrationStopped", ""]
     for i in (2, 3):
         x0 = dict(zip(CRANE.q.names + CRANE.q.jet_names(1), plan.state(0.0), strict=True)) | {"x": starts[i]}
-        with pytest.raises(sv.ServoError) as caught:
+        with pytest.raises(sv.errors.ServoError) as caught:
             sv.close(sv.plant(CRANE, damping={"x": damping[i]}, limits=plant.limits), law, x0, span, timing=timing)
         assert f"t = {caught.value.details['t']:.6g} s" in many["message"][i]
     assert relative(many.trace["x"][:, 0], one["x"]) < 1e-10 and np.array_equal(many.trace["x"][:, 0], many.trace["x"][:, 4])
@@ -242,7 +242,7 @@ def test_a_loop_that_diverges_is_a_row_and_disturbs_no_other(plan):
     damping[4] = 1e5  # steps of 10 ms are far too long for it
     given = (law, plan.state(0.0), (0.0, 8.0))
     many = sv.close_many(sv.close(plant, *given, timing=sv.Timing(substeps=1)), {"damping x": damping})
-    with pytest.raises(sv.IntegrationStopped) as caught:
+    with pytest.raises(sv.errors.IntegrationStopped) as caught:
         sv.close(sv.plant(CRANE, damping={"x": 1e5}), *given, timing=sv.Timing(substeps=1))
     assert many["error"].tolist() == [""] * 4 + ["IntegrationStopped"] + [""] * 4
     assert f"t = {caught.value.details['t']:.6g} s" in many["message"][4]
@@ -310,27 +310,27 @@ def test_sine_and_cosine_of_the_lanes_are_within_two_units(n):
 def test_laws_in_python_are_sent_to_sweep(plan):
     plant = sv.plant(CRANE)
     one = sv.close(plant, lambda t, y: [0.0, -981.0], plan.state(0.0), (0.0, 0.1), timing=sv.Timing(rate=50.0))
-    with refused(sv.SpecificationError, "sv.sweep"):
+    with refused(sv.errors.SpecificationError, "sv.sweep"):
         sv.close_many(one, {"m_load": [100.0]})
-    with refused(sv.SpecificationError, "Closed"):
+    with refused(sv.errors.SpecificationError, "Closed"):
         sv.close_many(plan, {"m_load": [100.0]})
 
 
 BAD = {
-    "unknown column": (sv.NameUnknown, {"mload": [1.0]}, {}, {"match": "m_load"}),
-    "other lengths": (sv.SpecificationError, {"m_load": [1.0, 2.0], "theta": [0.0]}, {}, "cases"),
-    "a negative mass": (sv.SpecificationError, {"m_load": [90.0, -90.0, 110.0]}, {}, "m_load = -90"),
-    "a truth value": (sv.SpecificationError, {"m_load": [90.0, True]}, {}, "cases"),
-    "texts": (sv.SpecificationError, {"m_load": ["90.0"]}, {}, "cases"),
-    "not finite": (sv.SpecificationError, {"m_load": [np.nan]}, {}, "cases"),
-    "no case": (sv.SpecificationError, {}, {}, "cases"),
-    "empty columns": (sv.SpecificationError, {"m_load": []}, {}, "cases"),
-    "every without traces": (sv.SpecificationError, {"m_load": [100.0]}, {"every": 5}, "every=5"),
-    "a name alone": (sv.SpecificationError, {"m_load": [100.0]}, {"record": "theta"}, "record='theta'"),
-    "scale of no disturbance": (sv.NameUnknown, {"m_load": [1.0]}, {"scale": {"x": "m_load"}}, {"name": "x"}),
-    "scale without its column": (sv.NameUnknown, {"m_load": [1.0]}, {"scale": {"theta": "w"}}, {"name": "w"}),
-    "trace of nothing": (sv.NameUnknown, {"m_load": [100.0]}, {"record": ("thet",)}, {"match": "theta"}),
-    "every": (sv.SpecificationError, {"m_load": [100.0]}, {"record": ("theta",), "every": 0}, "every=0"),
+    "unknown column": (sv.errors.NameUnknown, {"mload": [1.0]}, {}, {"match": "m_load"}),
+    "other lengths": (sv.errors.SpecificationError, {"m_load": [1.0, 2.0], "theta": [0.0]}, {}, "cases"),
+    "a negative mass": (sv.errors.SpecificationError, {"m_load": [90.0, -90.0, 110.0]}, {}, "m_load = -90"),
+    "a truth value": (sv.errors.SpecificationError, {"m_load": [90.0, True]}, {}, "cases"),
+    "texts": (sv.errors.SpecificationError, {"m_load": ["90.0"]}, {}, "cases"),
+    "not finite": (sv.errors.SpecificationError, {"m_load": [np.nan]}, {}, "cases"),
+    "no case": (sv.errors.SpecificationError, {}, {}, "cases"),
+    "empty columns": (sv.errors.SpecificationError, {"m_load": []}, {}, "cases"),
+    "every without traces": (sv.errors.SpecificationError, {"m_load": [100.0]}, {"every": 5}, "every=5"),
+    "a name alone": (sv.errors.SpecificationError, {"m_load": [100.0]}, {"record": "theta"}, "record='theta'"),
+    "scale of no disturbance": (sv.errors.NameUnknown, {"m_load": [1.0]}, {"scale": {"x": "m_load"}}, {"name": "x"}),
+    "scale without its column": (sv.errors.NameUnknown, {"m_load": [1.0]}, {"scale": {"theta": "w"}}, {"name": "w"}),
+    "trace of nothing": (sv.errors.NameUnknown, {"m_load": [100.0]}, {"record": ("thet",)}, {"match": "theta"}),
+    "every": (sv.errors.SpecificationError, {"m_load": [100.0]}, {"record": ("theta",), "every": 0}, "every=0"),
 }  # fmt: skip
 
 
@@ -354,5 +354,5 @@ def test_starts_off_the_constraints_are_refused():
     name = plant.state_names[0]
     start = plan.state(0.0)[0]
     one = sv.close(plant, law, plan.state(0.0), (0.0, 0.1))
-    with refused(sv.InconsistentStart, case=1):
+    with refused(sv.errors.InconsistentStart, case=1):
         sv.close_many(one, {name: [start, start + 0.1]})

@@ -71,10 +71,10 @@ def step(duration=1.0):
 
 def test_the_passive_arm_of_known_numbers():
     model = arm(0.5)
-    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded())
     assert run.state(0.5)[1] == pytest.approx(-0.308555247, abs=1e-9)
     assert run.state(1.5)[1] == pytest.approx(0.312284407, abs=1e-9)
-    fine = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=np.linspace(0.0, 2.0, 20001))
+    fine = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), t_eval=np.linspace(0.0, 2.0, 20001))
     assert np.degrees(np.abs(fine["q2"]).max()) == pytest.approx(19.303385, abs=1e-6)
     assert fine["torque"].min() == pytest.approx(-48.83509, abs=1e-5)
     assert fine["torque"].max() == pytest.approx(48.88454, abs=1e-5)
@@ -99,7 +99,7 @@ def test_a_general_solver_finds_the_same_motion():
     from scipy.integrate import solve_bvp
 
     model, start = cart_pole(step())
-    run = sv.simulate(model, start, (0.0, 1.0), sv.Bounded())
+    run = sv.simulate(model, start, (0.0, 1.0), sv.methods.Bounded())
     t = ca.SX.sym("t")
     jerk = ca.Function("a", [t], [ca.jacobian(ca.jacobian(step()(t), t), t)])
     rate = np.sqrt(9.81 / 0.5)
@@ -119,11 +119,11 @@ def test_a_general_solver_finds_the_same_motion():
 
 def test_it_is_a_forward_motion_where_the_internal_dynamics_are_stable():
     model = sv.derive(*gallery["passive-arm"].build())
-    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=np.linspace(0.0, 2.0, 101))
-    exact, start = sv.Taylor(rtol=1e-13, atol=1e-13), model.start(q2=0.0, dq2=0.0)
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), t_eval=np.linspace(0.0, 2.0, 101))
+    exact, start = sv.methods.Taylor(rtol=1e-13, atol=1e-13), model.start(q2=0.0, dq2=0.0)
     forward = sv.simulate(model, start, (0.0, 2.0), exact, t_eval=run.t)
     assert run.jets == pytest.approx(forward.jets, abs=1e-8)
-    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded())
     assert whole.t[0] == 0.0 and whole.t[-1] > 3.0  # nothing to do ahead of it
 
 
@@ -131,9 +131,9 @@ def test_it_is_a_forward_motion_where_the_internal_dynamics_are_stable():
 def test_the_error_of_the_window_falls_with_its_length(make, span):
     model = make()
     errors, said = [], []
-    exact = sv.simulate(model, model.start(), span, sv.Bounded(25.0), t_eval=np.linspace(*span, 201))
+    exact = sv.simulate(model, model.start(), span, sv.methods.Bounded(25.0), t_eval=np.linspace(*span, 201))
     for window in (1.0, 1.5, 2.0, 2.5, 3.0):
-        run = sv.simulate(model, model.start(), span, sv.Bounded(window), t_eval=exact.t)
+        run = sv.simulate(model, model.start(), span, sv.methods.Bounded(window), t_eval=exact.t)
         errors.append(np.abs((run.jets - exact.jets)[: len(model.state_names)]).max())
         said.append(float(run.message.split()[-1]))
     falls = -np.diff(np.log(errors)) / 0.5
@@ -144,14 +144,14 @@ def test_the_error_of_the_window_falls_with_its_length(make, span):
 @pytest.mark.parametrize("duration", [1.0, 0.5, 0.2, 0.1])
 def test_quick_steps_of_a_cart_pole(duration):
     model, start = cart_pole(step(duration))
-    run = sv.simulate(model, start, (0.0, duration), sv.Bounded())
+    run = sv.simulate(model, start, (0.0, duration), sv.methods.Bounded())
     assert run["a"][0] > 0 > run["a"][-1] and sv.verify(run).passed  # leans forward before the cart moves
     assert np.abs(run["x"][run.t <= 0]).max() < 1e-12
 
 
 def test_material_constraints_and_quasi_velocities_change_nothing():
     model, start = cart_pole(step())
-    expected = sv.simulate(model, start, (0.0, 1.0), sv.Bounded(), t_eval=np.linspace(0.0, 1.0, 101))
+    expected = sv.simulate(model, start, (0.0, 1.0), sv.methods.Bounded(), t_eval=np.linspace(0.0, 1.0, 101))
     q = sv.coordinates("x X Z")  # the pole's tip by its position, on a rod
     x, X, Z = q
     S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (X, Z))
@@ -159,7 +159,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing():
         q, gibbs=S, potential=0.2 * 9.81 * Z, actuators={"F": x}, constraints={"rod": (X - x) ** 2 + Z**2 - 0.25}
     )
     absolute = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}), guess={"Z": 0.5})
-    run = sv.simulate(absolute, absolute.start(guess={"Z": 0.5}), (0.0, 1.0), sv.Bounded(), t_eval=expected.t)
+    run = sv.simulate(absolute, absolute.start(guess={"Z": 0.5}), (0.0, 1.0), sv.methods.Bounded(), t_eval=expected.t)
     assert run["X"] == pytest.approx(expected["x"] + 0.5 * np.sin(expected["a"]), abs=1e-9)
     assert run["F"] == pytest.approx(expected["F"], abs=1e-7)
     q = sv.coordinates("x a").with_quasi_velocities("u v", [[1, 0], [-2 * ca.cos(0.3), 1]])
@@ -167,13 +167,13 @@ def test_material_constraints_and_quasi_velocities_change_nothing():
     S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
     mechanism = sv.Mechanism(q, gibbs=S, potential=0.2 * 9.81 * 0.5 * ca.cos(a), actuators={"F": x})
     other = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
-    run = sv.simulate(other, other.start(guess={"a": 0.0}), (0.0, 1.0), sv.Bounded(), t_eval=expected.t)
+    run = sv.simulate(other, other.start(guess={"a": 0.0}), (0.0, 1.0), sv.methods.Bounded(), t_eval=expected.t)
     assert run["a"] == pytest.approx(expected["a"], abs=1e-9) and run["F"] == pytest.approx(expected["F"], abs=1e-7)
 
 
 def test_a_law_follows_the_bounded_plan():
     model = arm(0.5)
-    plan = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(15.0), t_eval=None)
+    plan = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(15.0), t_eval=None)
     plant = sv.plant(model.reduction.mechanism)
     law = sv.lqr(plan, plant, rate=1000.0)
     run = sv.close(plant, law, plan.state(plan.t[0]), (plan.t[0], plan.t[-1]))
@@ -186,7 +186,7 @@ def test_a_law_follows_the_bounded_plan():
 def arm_plan():
     """The bounded motion of the passive arm, with the rests before and after it."""
     model = arm(0.5)
-    return sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(15.0))
+    return sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(15.0))
 
 
 def test_feedforward_of_a_bounded_plan_holds_as_long_as_errors_are_small(arm_plan):
@@ -223,7 +223,7 @@ def test_a_bounded_plan_in_files_verdicts_and_loops_of_many_cases(arm_plan, tmp_
 def bounded_case(c):
     """The peak torque of a bounded motion with another stiffness of the joint."""
     model = arm(0.5, c=c)
-    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded())
     return {"peak": run.extrema("torque")[1][1]}
 
 
@@ -268,7 +268,7 @@ def stiff_forces(damping, stiffness):
 def test_stiff_modes_beside_an_unstable_one(damping, stiffness):
     """They need no more intervals than their layers beside corners, and the others have their closed form."""
     model = masses(stiff_forces(damping, stiffness), follows)
-    run = sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 1.0), sv.methods.Bounded())
     assert run.counters["intervals"] < 2500
     for t in (-0.3, 0.0, 0.4, 1.0, 1.5):
         assert run.state(t)[1] == pytest.approx(convolved(s9, 5.0, t), abs=1e-12)
@@ -277,7 +277,7 @@ def test_stiff_modes_beside_an_unstable_one(damping, stiffness):
 def test_unstable_modes_that_no_mesh_resolves_are_refused():
     model = masses(stiff_forces(-8e4, -8e5), follows)
     with refused(LimitExceeded, "4000", most=4000):
-        sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+        sv.simulate(model, model.start(), (0.0, 1.0), sv.methods.Bounded())
 
 
 def test_a_program_of_accelerations_has_no_invariants():
@@ -286,7 +286,7 @@ def test_a_program_of_accelerations_has_no_invariants():
         lambda x, v: (4 * x[1] + x[0], -x[2] - v[2]),
         lambda t, x, v, a: a[0] + 3 * v[0] + 2 * x[0] - 2 * step()(t),
     )
-    run = sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 1.0), sv.methods.Bounded())
     assert not model.invariant_names() and sv.verify(run).passed
     assert run.state(run.t[0])[1] == pytest.approx(0.0, abs=1e-4) and run.state(run.t[-1])[1] == pytest.approx(-0.25, abs=1e-4)
     assert run.state(1.0)[1] == pytest.approx(convolved(lambda s: run.state(np.clip(s, *run.t[[0, -1]]))[0], 2.0, 1.0), abs=1e-6)
@@ -297,25 +297,25 @@ def test_accelerations_that_leave_an_oscillation_are_marginal():
     model = masses(lambda x, v: (-x[1], -x[2]), lambda t, x, v, a: a[0] - ca.sin(t))
     assert sv.report(model).verdict == "marginal"
     with refused(UnstableInternalDynamics, "imaginary axis"):
-        sv.simulate(model, model.start(), (0.0, 1.0), sv.Bounded())
+        sv.simulate(model, model.start(), (0.0, 1.0), sv.methods.Bounded())
 
 
 def test_samples_within_the_window():
     """The actuation ahead of the program, at any rate; its message says what samples leave out."""
     model = arm(0.5)
-    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded())
     times = np.linspace(whole.t[0], whole.t[-1], 2001)
     run = sv.simulate(model, model.start(), (0.0, 2.0), "bounded", t_eval=times)
     assert np.array_equal(run.t, times) and "leave out" not in run.message and sv.verify(run).passed
     assert np.abs(run["torque"] - np.interp(times, whole.t, whole["torque"])).max() < 0.05
-    part = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=[0.0, 1.0, 2.5])
+    part = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), t_eval=[0.0, 1.0, 2.5])
     assert "leave out the motion before t = 0 s;" in part.message and "after" not in part.message
     assert part.jets[:4, 1] == pytest.approx(whole.state(1.0), abs=1e-9)
     with refused(SpecificationError, "window", window=(float(whole.t[0]), float(whole.t[-1]))):
-        sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=[-50.0, 1.0])
+        sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), t_eval=[-50.0, 1.0])
     for times in ([], [0.0, np.nan]):
         with refused(SpecificationError, "t_eval"):
-            sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=times)
+            sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), t_eval=times)
 
 
 # refusals -------------------------------------------------------------------------------------------------------------
@@ -335,7 +335,7 @@ def test_a_mesh_keeps_all_corners_and_follows_the_fastest_mode(count):
 def test_internal_dynamics_on_the_imaginary_axis_are_refused():
     model, start = cart_pole(step(), start=pi)
     with refused(UnstableInternalDynamics, "imaginary axis", t=0.0):
-        sv.simulate(model, start, (0.0, 1.0), sv.Bounded())
+        sv.simulate(model, start, (0.0, 1.0), sv.methods.Bounded())
 
 
 def test_rolling_as_a_constraint_of_velocities_has_the_motion_of_its_integral():
@@ -348,7 +348,7 @@ def test_rolling_as_a_constraint_of_velocities_has_the_motion_of_its_integral():
     for roll in (q.d(1)[0] - 0.2 * q.d(1)[1], x - 0.2 * phi):
         mechanism = sv.Mechanism(q, gibbs=S, potential=U, constraints={"roll": roll}, actuators={"T": phi})
         model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
-        runs.append(sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.Bounded()))
+        runs.append(sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.methods.Bounded()))
         values = Problem(model, (0.0, 1.0), runs[-1].start.values).first.modes.eigenvalues
         assert values == pytest.approx([(9.81 / 0.7) ** 0.5, -((9.81 / 0.7) ** 0.5)], abs=1e-9)
     for name in ("T", "a", "phi"):
@@ -364,14 +364,14 @@ def test_ends_that_differ_in_their_unstable_modes_are_refused():
     mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces={"a": -0.2 * q.d(1)[1]}, actuators={"F": x})
     model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
     with refused(UnstableInternalDynamics, unstable=[0, 1]):
-        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.Bounded())
+        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.methods.Bounded())
 
 
 @pytest.mark.parametrize("path, end", [(lambda t: ca.sin(3 * t), 1.0), (step(), 0.6)], ids=["oscillates", "cut short"])
 def test_a_program_that_does_not_stand_still_outside_its_span_is_refused(path, end):
     model, start = cart_pole(path)
     with refused(SpecificationError, "stands still", span=(0.0, end)):
-        sv.simulate(model, start, (0.0, end), sv.Bounded())
+        sv.simulate(model, start, (0.0, end), sv.methods.Bounded())
 
 
 def test_switches_of_the_state_are_refused():
@@ -382,21 +382,21 @@ def test_switches_of_the_state_are_refused():
     mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces={"a": -0.1 * ca.sign(q.d(1)[1])}, actuators={"F": x})
     model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
     with refused(SpecificationError, "kinks or switches"):
-        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.Bounded())
+        sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.methods.Bounded())
 
 
 def test_what_bounded_motions_do_not_take_is_refused(gallery_model):
     model, start = cart_pole(step())
     with refused(SpecificationError, "(0, 1)", t_span=(1.0, 0.0)):
-        sv.simulate(model, model.start(t=1.0, a=0.0, da=0.0), (1.0, 0.0), sv.Bounded())
+        sv.simulate(model, model.start(t=1.0, a=0.0, da=0.0), (1.0, 0.0), sv.methods.Bounded())
     with refused(SpecificationError, "Project", method="bounded"):
-        sv.simulate(model, start, (0.0, 1.0), sv.Bounded(), drift="project")
+        sv.simulate(model, start, (0.0, 1.0), sv.methods.Bounded(), drift="project")
     crane = gallery_model("overhead-crane")
     with refused(SpecificationError, "algebraic", free=0):
-        sv.simulate(crane, crane.start(guess=gallery["overhead-crane"].guess), (0.0, 8.0), sv.Bounded())
+        sv.simulate(crane, crane.start(guess=gallery["overhead-crane"].guess), (0.0, 8.0), sv.methods.Bounded())
     wheel = gallery_model("appell-hamel")
     with refused(IntegrationStopped, "equilibrium"):
-        sv.simulate(wheel, wheel.start(**gallery["appell-hamel"].start), (0.0, 1.0), sv.Bounded())
+        sv.simulate(wheel, wheel.start(**gallery["appell-hamel"].start), (0.0, 1.0), sv.methods.Bounded())
     for window in (0.0, -1.0, 1e4, "long", None):
         with refused(SpecificationError, "window", window=window):
-            sv.Bounded(window)
+            sv.methods.Bounded(window)

@@ -45,12 +45,12 @@ def _simulated(model, scene, method, drift):
     start = model.start(**scene.start, guess=scene.guess)
     t_eval = np.linspace(t0, t1, 101) if method not in (None, "RK4") else None
     if method == "RK4":
-        method = sv.RungeKutta(4, step=(t1 - t0) / 4000)
+        method = sv.methods.RungeKutta(4, step=(t1 - t0) / 4000)
     elif method in ("DOP853", "Taylor"):
         method = as_method(method, rtol=1e-12, atol=1e-13)
     try:
         return model, sv.simulate(model, start, scene.t_span, method, drift=drift, t_eval=t_eval)
-    except sv.SingularProgram as error:
+    except sv.errors.SingularProgram as error:
         return model, error.run
 
 
@@ -135,7 +135,7 @@ def test_a_drifted_state_fails(scene_run):
 def test_higher_jets_excuse_no_residual(gallery_model):
     model, scene = gallery_model("appell-hamel"), gallery["appell-hamel"]
     start = model.start(**scene.start, guess=scene.guess)
-    run = sv.simulate(model, start, (0.0, 0.1), method=sv.Taylor(jets=12))
+    run = sv.simulate(model, start, (0.0, 0.1), method=sv.methods.Taylor(jets=12))
     moved = run.jets.copy()
     moved[2] += 1e-5  # z off the string
     short = moved[: len(model.jet_names)]
@@ -160,7 +160,7 @@ def test_every_number_has_its_limit_beside_it(scene_run):
 
 @pytest.mark.parametrize("segments", [0, -1, "a", 2.5, True, None, 10_001, 1e300, 2**70, ca.SX.sym("n")], ids=str)
 def test_segments_that_check_nothing_are_refused(segments, scene_run):
-    with refused(sv.SpecificationError, "segments"):
+    with refused(sv.errors.SpecificationError, "segments"):
         sv.verify(scene_run("overhead-crane")[1], segments=segments)
 
 

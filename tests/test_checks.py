@@ -10,7 +10,7 @@ from servoctl.units import as_units
 
 
 def error_of(check, *given, **options):
-    with pytest.raises(sv.SpecificationError) as caught:
+    with pytest.raises(sv.errors.SpecificationError) as caught:
         check(*given, **options)
     return caught.value
 

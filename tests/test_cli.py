@@ -381,7 +381,7 @@ def test_nowhere_to_write_is_an_error_not_a_traceback(here, fall, capsys, monkey
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(servoctl.Run, "save", full)
+    monkeypatch.setattr(servoctl.types.Run, "save", full)
     monkeypatch.setattr("tempfile.tempdir", str(here))
     assert main(["run", fall, "--no-verify"]) == 2
     out, err = capsys.readouterr()
@@ -404,7 +404,7 @@ def test_no_empty_folder_stays_where_nothing_can_be_written(here, fall, monkeypa
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(servoctl.Run, "save", full)
+    monkeypatch.setattr(servoctl.types.Run, "save", full)
     assert main(["run", fall, "--no-verify"]) == 2
     assert not list((here / "temporary").iterdir()) and not (here / "servoctl-runs").exists()
 
@@ -445,11 +445,11 @@ def test_options_reach_the_simulation(fall, monkeypatch):
     assert main(["run", fall, *line.split()]) == 2
     assert given["t_eval"] == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0]) and given["t_eval"][-1] == 1.0
     del given["t_eval"]
-    expected = {"method": servoctl.RungeKutta(4, step=1e-3), "drift": "project"}
+    expected = {"method": servoctl.methods.RungeKutta(4, step=1e-3), "drift": "project"}
     assert given == {**expected, "span": (0.5, 1.0), "t": 0.5}
     given.clear()
     assert main(["run", fall, "--method", "Radau", "--rtol", "1e-6", "--atol", "1e-7"]) == 2
-    assert given == {"method": servoctl.Adaptive("Radau", 1e-6, 1e-7), "span": (0.0, 1.0), "t": 0.0}
+    assert given == {"method": servoctl.methods.Adaptive("Radau", 1e-6, 1e-7), "span": (0.0, 1.0), "t": 0.0}
     given.clear()
     assert main(["run", fall, "--drift", "0.1"]) == 2
     assert given == {"drift": 0.1, "span": (0.0, 1.0), "t": 0.0}
@@ -474,7 +474,7 @@ def test_an_interrupted_verification_keeps_the_run(here, fall, capsys, monkeypat
 
 
 def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch):
-    failed = servoctl.Verification({"balance": float("nan")}, ("balance",), limits={"balance": 1e-6})
+    failed = servoctl.types.Verification({"balance": float("nan")}, ("balance",), limits={"balance": 1e-6})
     monkeypatch.setattr(servoctl, "verify", lambda *_: failed)
     assert main(["run", fall, "--no-figures"]) == 1
     verification = summary(here / "servoctl-runs" / "fall")["verification"]
@@ -482,7 +482,7 @@ def test_a_failed_verification_is_seen_in_the_exit_code(here, fall, monkeypatch)
 
 
 def test_an_inconclusive_verification_has_an_exit_code_of_its_own(here, fall, monkeypatch):
-    doubtful = servoctl.Verification({}, doubts=("No sample was checked.",))
+    doubtful = servoctl.types.Verification({}, doubts=("No sample was checked.",))
     monkeypatch.setattr(servoctl, "verify", lambda *_: doubtful)
     assert main(["run", fall, "--no-figures"]) == 3
     assert summary(here / "servoctl-runs" / "fall")["verification"]["verdict"] == "inconclusive"

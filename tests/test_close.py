@@ -127,7 +127,7 @@ def test_gains_too_fast_for_their_rate_are_refused(point_plan, product, fast):
     p = 20.0
     gains = {"kp": {"force": 2.0 * p**2}, "kd": {"force": 2.0 * 2 * p}}
     if fast:
-        with refused(sv.ServoError, "0.6752"):
+        with refused(sv.errors.ServoError, "0.6752"):
             sv.pd(point_plan, sv.plant(POINT), rate=p / product, **gains)
     else:
         law = sv.pd(point_plan, sv.plant(POINT), rate=p / product, **gains)
@@ -220,7 +220,7 @@ def test_measurements_and_states_are_not_changed(is_compiled, monkeypatch):
 def test_a_law_with_a_controller_state_is_started(crane_plan):
     plant = sv.plant(CRANE)
     law = sv.lqr(crane_plan, plant, integral=True)
-    with refused(sv.SpecificationError, "law.start", "integral of X"):
+    with refused(sv.errors.SpecificationError, "law.start", "integral of X"):
         law(0.0, crane_plan.state(0.0))
     run = sv.close(sv.plant(CRANE, m_load=115.0), law, crane_plan.state(0.0), (0.0, 1.0))
     controller = law.start()
@@ -350,50 +350,50 @@ def close(plant=None, law=LAW, x0=(0.0, 0.0), span=(0.0, 1.0), rate=20.0, delay=
 
 
 BAD = {
-    "no plant": (lambda: close(plant=POINT), sv.SpecificationError, "sv.plant"),
-    "no law": (lambda: close(law=3.0), sv.SpecificationError, "float"),
-    "no rate": (lambda: close(rate=None), sv.SpecificationError, "rate"),
-    "negative rate": (lambda: close(rate=-5.0), sv.SpecificationError, "-5"),
-    "time that is no sample": (lambda: close(span=(0.0, 1.01)), sv.SpecificationError, {"number": 20.2}),
-    "time backwards": (lambda: close(span=(1.0, 0.0)), sv.SpecificationError, "(1.0, 0.0)"),
-    "half a delay": (lambda: close(delay=0.5), sv.SpecificationError, {"name": "delay", "value": 0.5}),
-    "negative delay": (lambda: close(delay=-1), sv.SpecificationError, {"name": "delay", "value": -1}),
-    "half a step": (lambda: close(substeps=1.5), sv.SpecificationError, {"name": "substeps", "value": 1.5}),
-    "no step": (lambda: close(substeps=0), sv.SpecificationError, "substeps"),
+    "no plant": (lambda: close(plant=POINT), sv.errors.SpecificationError, "sv.plant"),
+    "no law": (lambda: close(law=3.0), sv.errors.SpecificationError, "float"),
+    "no rate": (lambda: close(rate=None), sv.errors.SpecificationError, "rate"),
+    "negative rate": (lambda: close(rate=-5.0), sv.errors.SpecificationError, "-5"),
+    "time that is no sample": (lambda: close(span=(0.0, 1.01)), sv.errors.SpecificationError, {"number": 20.2}),
+    "time backwards": (lambda: close(span=(1.0, 0.0)), sv.errors.SpecificationError, "(1.0, 0.0)"),
+    "half a delay": (lambda: close(delay=0.5), sv.errors.SpecificationError, {"name": "delay", "value": 0.5}),
+    "negative delay": (lambda: close(delay=-1), sv.errors.SpecificationError, {"name": "delay", "value": -1}),
+    "half a step": (lambda: close(substeps=1.5), sv.errors.SpecificationError, {"name": "substeps", "value": 1.5}),
+    "no step": (lambda: close(substeps=0), sv.errors.SpecificationError, "substeps"),
     "transport between steps": (
-        lambda: close(plant=sv.plant(POINT, delay=0.02), substeps=1), sv.SpecificationError, {"name": "force"},
+        lambda: close(plant=sv.plant(POINT, delay=0.02), substeps=1), sv.errors.SpecificationError, {"name": "force"},
     ),
-    "noise on nothing": (lambda: close(sensors=sv.Sensors(noise={"y": 0.1})), sv.NameUnknown, {"valid": ("x", "dx")}),
-    "negative noise": (lambda: close(sensors=sv.Sensors(noise={"x": -0.1})), sv.SpecificationError, "-0.1"),
-    "seed of nothing": (lambda: close(sensors=sv.Sensors(seed=3)), sv.SpecificationError, "seed"),
-    "odd seed": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed=0.5)), sv.SpecificationError, "seed=0.5"),
-    "noise of a number": (lambda: sv.Sensors(noise=0), sv.SpecificationError, "noise"),
-    "quantisation of a text": (lambda: sv.Sensors(quantisation=""), sv.SpecificationError, "quantisation"),
-    "quantised nothing": (lambda: close(sensors=sv.Sensors(quantisation={"y": 0.1})), sv.NameUnknown, {"valid": ("x", "dx")}),
-    "disturbance of nothing": (lambda: close(disturbance={"dx": LAW}), sv.NameUnknown, {"name": "dx"}),
-    "disturbance of text": (lambda: close(disturbance={"x": "gust"}), sv.SpecificationError, {"name": "x"}),
-    "disturbance of NaN": (lambda: close(disturbance={"x": lambda t: np.nan * t}), sv.SpecificationError, {"name": "x"}),
-    "disturbance of lists": (lambda: close(disturbance={"x": lambda t: [1, 2]}), sv.SpecificationError, {"name": "x"}),
+    "noise on nothing": (lambda: close(sensors=sv.Sensors(noise={"y": 0.1})), sv.errors.NameUnknown, {"valid": ("x", "dx")}),
+    "negative noise": (lambda: close(sensors=sv.Sensors(noise={"x": -0.1})), sv.errors.SpecificationError, "-0.1"),
+    "seed of nothing": (lambda: close(sensors=sv.Sensors(seed=3)), sv.errors.SpecificationError, "seed"),
+    "odd seed": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed=0.5)), sv.errors.SpecificationError, "seed=0.5"),
+    "noise of a number": (lambda: sv.Sensors(noise=0), sv.errors.SpecificationError, "noise"),
+    "quantisation of a text": (lambda: sv.Sensors(quantisation=""), sv.errors.SpecificationError, "quantisation"),
+    "quantised nothing": (lambda: close(sensors=sv.Sensors(quantisation={"y": 0.1})), sv.errors.NameUnknown, {"valid": ("x", "dx")}),
+    "disturbance of nothing": (lambda: close(disturbance={"dx": LAW}), sv.errors.NameUnknown, {"name": "dx"}),
+    "disturbance of text": (lambda: close(disturbance={"x": "gust"}), sv.errors.SpecificationError, {"name": "x"}),
+    "disturbance of NaN": (lambda: close(disturbance={"x": lambda t: np.nan * t}), sv.errors.SpecificationError, {"name": "x"}),
+    "disturbance of lists": (lambda: close(disturbance={"x": lambda t: [1, 2]}), sv.errors.SpecificationError, {"name": "x"}),
     "start off the rope": (
         lambda: close(plant=sv.plant(ROPE), law=lambda t, y: [0.0, 0.0], x0=[0.0, 4.0, 1.0, 4.0, 0.0, 0.0, 0.0, 0.0]),
-        sv.InconsistentStart, {"values": {"rope": 1.0, "D(rope)": 0.0}},
+        sv.errors.InconsistentStart, {"values": {"rope": 1.0, "D(rope)": 0.0}},
     ),
-    "start of NaN": (lambda: close(x0=[np.nan, 0.0]), sv.SpecificationError, {"names": ("x", "dx")}),
-    "law of two inputs": (lambda: close(law=lambda t, y: [0.0, 1.0]), sv.SpecificationError, "force"),
-    "law of an odd name": (lambda: close(law=lambda t, y: {"forc": 0.0}), sv.NameUnknown, {"match": "force"}),
-    "law of NaN": (lambda: close(law=lambda t, y: [np.nan if t > 0.52 else 0.0]), sv.ServoError, {"t": 0.55}),
-    "law that is a class": (lambda: close(law=Counting), sv.SpecificationError, "type"),
-    "law that starts nothing": (lambda: close(law=Idle()), sv.SpecificationError, "'Idle'"),
-    "plan of no model": (lambda: close(plan=3.0), sv.SpecificationError, "float"),
-    "sensors of a dict": (lambda: close(sensors={"noise": {"x": 0.1}}), sv.SpecificationError, "sv.Sensors"),
-    "seed of text": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed="")), sv.SpecificationError, "seed=''"),
-    "seed of no noise": (lambda: close(sensors=sv.Sensors(noise={}, seed=1)), sv.SpecificationError, "seed"),
+    "start of NaN": (lambda: close(x0=[np.nan, 0.0]), sv.errors.SpecificationError, {"names": ("x", "dx")}),
+    "law of two inputs": (lambda: close(law=lambda t, y: [0.0, 1.0]), sv.errors.SpecificationError, "force"),
+    "law of an odd name": (lambda: close(law=lambda t, y: {"forc": 0.0}), sv.errors.NameUnknown, {"match": "force"}),
+    "law of NaN": (lambda: close(law=lambda t, y: [np.nan if t > 0.52 else 0.0]), sv.errors.ServoError, {"t": 0.55}),
+    "law that is a class": (lambda: close(law=Counting), sv.errors.SpecificationError, "type"),
+    "law that starts nothing": (lambda: close(law=Idle()), sv.errors.SpecificationError, "'Idle'"),
+    "plan of no model": (lambda: close(plan=3.0), sv.errors.SpecificationError, "float"),
+    "sensors of a dict": (lambda: close(sensors={"noise": {"x": 0.1}}), sv.errors.SpecificationError, "sv.Sensors"),
+    "seed of text": (lambda: close(sensors=sv.Sensors(noise={"x": 0.1}, seed="")), sv.errors.SpecificationError, "seed=''"),
+    "seed of no noise": (lambda: close(sensors=sv.Sensors(noise={}, seed=1)), sv.errors.SpecificationError, "seed"),
     "lag far below the period": (
-        lambda: close(plant=sv.plant(POINT, lag={"force": 1e-6})), sv.SpecificationError, "1e+06 1/s",
+        lambda: close(plant=sv.plant(POINT, lag={"force": 1e-6})), sv.errors.SpecificationError, "1e+06 1/s",
     ),
     "force without a slope": (
         lambda: close(plant=sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})),
-        sv.SpecificationError, "substeps",
+        sv.errors.SpecificationError, "substeps",
     ),
     "law that fails": (lambda: close(law=lambda t, y: [y["z"]]), KeyError, "z"),
 }  # fmt: skip
@@ -415,19 +415,19 @@ def test_bad_input_is_refused_by_name(what):
 
 
 def test_what_was_computed_before_a_law_failed_is_kept():
-    with pytest.raises(sv.ServoError) as caught:
+    with pytest.raises(sv.errors.ServoError) as caught:
         close(law=lambda t, y: [np.nan if t > 0.52 else 1.0])
     assert caught.value.run.t[-1] == pytest.approx(0.5) and not caught.value.run.success
     with pytest.raises(KeyError) as caught:
         close(law=lambda t, y: [y["z"] if t > 0.52 else 1.0])
     assert caught.value.run.t[-1] == pytest.approx(0.5) and "raised KeyError" in caught.value.run.message
-    with pytest.raises(sv.ServoError) as caught:
+    with pytest.raises(sv.errors.ServoError) as caught:
         close(law=lambda t, y: [np.nan])
     assert "no samples" in repr(caught.value.run.to_run()) and "0 samples" in repr(caught.value.run)
 
 
 def test_a_loop_that_diverges_stops_with_its_motion():
-    with refused(sv.IntegrationStopped, "3.15 s") as caught:
+    with refused(sv.errors.IntegrationStopped, "3.15 s") as caught:
         close(
             plant=sv.plant(POINT, forces={"x": 1e6 * next(iter(POINT.q))}), x0=(1.0, 1.0), span=(0.0, 50.0), substeps=1
         )
@@ -443,50 +443,50 @@ def handmade(step=lambda t, x, row: [-x[0], -981.0], **other):
 def test_a_handmade_law_that_answers_otherwise_is_refused(crane_plan, answer):
     law = handmade(lambda t, x, row: answer)
     for ask in (lambda: law(0.0, [0.0]), lambda: sv.close(sv.plant(CRANE), law, crane_plan.state(0.0), (0.0, 0.1))):
-        with refused(sv.SpecificationError, "2 numbers", t=0.0):
+        with refused(sv.errors.SpecificationError, "2 numbers", t=0.0):
             ask()
 
 
 @pytest.mark.parametrize("measurement", ["a", None, {"x": None}, [0.0, 1.0]])
 def test_what_is_no_measurement_is_refused(measurement):
-    with refused(sv.SpecificationError, names=("x",)):
+    with refused(sv.errors.SpecificationError, names=("x",)):
         handmade()(0.0, measurement)
 
 
 def test_a_law_is_asked_at_times_and_has_a_rate():
-    with refused(sv.SpecificationError, name="t"):
+    with refused(sv.errors.SpecificationError, name="t"):
         handmade()(np.nan, [0.0])
-    with refused(sv.SpecificationError, name="rate", value=0.0):
+    with refused(sv.errors.SpecificationError, name="rate", value=0.0):
         handmade(rate=0.0)
 
 
 def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tmp_path):
-    with refused(sv.NameUnknown, name="x"):
+    with refused(sv.errors.NameUnknown, name="x"):
         sv.feedforward(point_plan, sv.plant(gallery["two-cars"].build()[0]))
-    with refused(sv.SpecificationError, "Run", "plan"):
+    with refused(sv.errors.SpecificationError, "Run", "plan"):
         sv.feedforward(sv.load(point_plan.save(tmp_path / "plan")), sv.plant(POINT))
-    with refused(sv.SpecificationError, "50 Hz", "100 Hz"):
+    with refused(sv.errors.SpecificationError, "50 Hz", "100 Hz"):
         law, timing = sv.feedforward(point_plan, sv.plant(POINT)), sv.Timing(rate=50.0)
         sv.close(sv.plant(POINT), law, [0, 0], (0.0, 1.0), timing=timing)
-    with refused(sv.SpecificationError, "0.005 s", number=0.5):
+    with refused(sv.errors.SpecificationError, "0.005 s", number=0.5):
         sv.close(sv.plant(POINT), sv.feedforward(point_plan, sv.plant(POINT)), [0, 0], (0.005, 1.005))
-    with refused(sv.SpecificationError, "2 s", "10 s"):
+    with refused(sv.errors.SpecificationError, "2 s", "10 s"):
         sv.feedforward(point_plan, sv.plant(POINT), rate=0.1)
     law = sv.pd(point_plan, sv.plant(POINT), kp={"force": 100.0}, kd={"force": 20.0})
     for wrong in ({"schedule": law.schedule[:2]}, {"state": np.zeros(1)}, {"measures": ()}, {"initial_input": np.zeros(2)}):
-        with refused(sv.SpecificationError, law.name):
+        with refused(sv.errors.SpecificationError, law.name):
             replace(law, **wrong)
     rough = sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})
-    with refused(sv.ServoError, "plant", t=pytest.approx(1.005)):
+    with refused(sv.errors.ServoError, "plant", t=pytest.approx(1.005)):
         sv.pd(point_plan, rough, kp={"force": 100.0})
     for make in (sv.feedforward, sv.pd, sv.lqr, sv.computed):
-        with refused(sv.SpecificationError, "Mechanism", "sv.plant"):
+        with refused(sv.errors.SpecificationError, "Mechanism", "sv.plant"):
             make(point_plan, POINT)
-    with refused(sv.SpecificationError, "kp", "'force'"):
+    with refused(sv.errors.SpecificationError, "kp", "'force'"):
         sv.pd(point_plan, sv.plant(POINT), kp={"force": [1.0, 2.0]})
-    with refused(sv.NameUnknown, name="forc", match="force"):
+    with refused(sv.errors.NameUnknown, name="forc", match="force"):
         sv.pd(point_plan, sv.plant(POINT), kp={"forc": 1.0})
-    with refused(sv.NameUnknown, name="trolley"):
+    with refused(sv.errors.NameUnknown, name="trolley"):
         sv.close(sv.plant(POINT), sv.feedforward(crane_plan, sv.plant(CRANE)), [0, 0], (0.0, 1.0))
 
 
@@ -494,7 +494,7 @@ def test_an_ideal_plan_is_no_command():
     mechanism, program = gallery["two-cars-ideal"].build()
     model = sv.derive(mechanism, program)
     plan = sv.simulate(model, model.start(guess={"x2": 0.0}), (0.0, 0.1))
-    with refused(sv.NotRealisable, "ideal"):
+    with refused(sv.errors.NotRealisable, "ideal"):
         sv.feedforward(plan, sv.plant(mechanism))
 
 
@@ -507,7 +507,7 @@ def test_more_samples_than_fit_into_memory_are_refused_with_their_number():
         lambda: sv.lqr(plan, plant),
         lambda: sv.close(plant, lambda t, y: [0.0, -981.0], plan.state(2.0), (0.0, 1e9), timing=sv.Timing(100.0)),
     ):
-        with refused(sv.SpecificationError, "GB", samples=pytest.approx(1e11, rel=1e-8)):
+        with refused(sv.errors.SpecificationError, "GB", samples=pytest.approx(1e11, rel=1e-8)):
             build()
 
 
@@ -539,9 +539,9 @@ def test_a_closed_run_is_saved_and_loaded(crane_plan, tmp_path):
     assert np.array_equal(back["measured x"], run.measured["x"])
     assert np.array_equal(back.residual["X"], run.residual["X"])
     assert len(repr(run).splitlines()) <= 8 and len(repr(run.law).splitlines()) <= 12
-    with refused(sv.NameUnknown, name="thetta", match="theta"):
+    with refused(sv.errors.NameUnknown, name="thetta", match="theta"):
         run["thetta"]
-    with refused(sv.SpecificationError, "0.005 s"):
+    with refused(sv.errors.SpecificationError, "0.005 s"):
         run.state(0.005)
 
 
@@ -558,9 +558,9 @@ def test_a_closed_run_travels_as_itself(crane_plan):
     assert np.array_equal(sent["d2theta"], run["d2theta"]) and np.array_equal(sent.residual["Z"], run.residual["Z"])
     again = sv.close(sent.plant, sent.law, x0, span, **options | {"disturbance": gust}, plan=sent.plan)
     assert np.array_equal(again.states, run.states)
-    with refused(sv.SpecificationError, "'x'", what="disturbance of 'x'"):
+    with refused(sv.errors.SpecificationError, "'x'", what="disturbance of 'x'"):
         pickle.dumps(sv.close(plant, law, x0, span, **options | {"disturbance": {"x": lambda t: 0.0}}))
-    with refused(sv.SpecificationError, what="law '<lambda>'"):
+    with refused(sv.errors.SpecificationError, what="law '<lambda>'"):
         pickle.dumps(sv.close(plant, lambda t, y: [0.0, 0.0], x0, span, timing=sv.Timing(rate=100.0)))
 
 

@@ -102,7 +102,7 @@ def test_a_lag_needs_a_path_of_the_next_class():
     """Its command holds one derivative more than the plan's actuation, which this path has not."""
     plan, _ = planned("two-link-arm")
     plant = sv.plant(plan.model.reduction.mechanism, lag={"shoulder": 0.02, "elbow": 0.02})
-    with refused(sv.SpecificationError, name="X", needs=3, has=2, t=0.0):
+    with refused(sv.errors.SpecificationError, name="X", needs=3, has=2, t=0.0):
         sv.computed(plan, plant)
 
 
@@ -135,7 +135,7 @@ def test_unstable_internal_dynamics_are_refused_with_a_pointer():
     model = sv.derive(*vtol("centre"))
     with warned("unstable over these 0.5 s"):
         plan = sv.simulate(model, model.start(theta=0.0, dtheta=0.0), (0.0, 0.5))
-    with refused(sv.UnstableInternalDynamics, "lqr", states=("theta", "dtheta"), eigenvalue=pytest.approx(15.09, abs=0.01)):
+    with refused(sv.errors.UnstableInternalDynamics, "lqr", states=("theta", "dtheta"), eigenvalue=pytest.approx(15.09, abs=0.01)):
         sv.computed(plan, sv.plant(model.reduction.mechanism))
 
 
@@ -186,7 +186,7 @@ def test_loops_turn_unstable_where_the_bound_says_within_two_per_cent(rho, delay
 def test_poles_too_fast_for_the_rate_are_refused_with_the_number(crane_plan, delay):
     plant = sv.plant(crane_plan.model.reduction.mechanism)
     bound = sampled_bound(4, delay)
-    with refused(sv.SpecificationError, f"{bound * 50:.4g}", name="X", bound=pytest.approx(bound, rel=1e-9)):
+    with refused(sv.errors.SpecificationError, f"{bound * 50:.4g}", name="X", bound=pytest.approx(bound, rel=1e-9)):
         sv.computed(crane_plan, plant, rate=50.0, poles=1 / (1.01 * bound * 50), delay=delay)
     sv.computed(crane_plan, plant, rate=50.0, poles=1 / (0.99 * bound * 50), delay=delay)
 
@@ -197,20 +197,20 @@ def test_bad_input(crane_plan):
     for poles, fact in (
         ({"X": [-1.0, -1.0]}, wrong), ({"X": [-1 + 1j] * 4, "Z": [-1.0] * 4}, wrong), ([-1.0] * 4, "'X'"),
     ):  # fmt: skip
-        with refused(sv.SpecificationError, fact):
+        with refused(sv.errors.SpecificationError, fact):
             sv.computed(crane_plan, plant, poles=poles)
-    with refused(sv.SpecificationError, name="X", order=4):
+    with refused(sv.errors.SpecificationError, name="X", order=4):
         sv.computed(crane_plan, plant, poles={"X": "fast", "Z": [-1.0] * 4})
-    with refused(sv.SpecificationError, name="X"):
+    with refused(sv.errors.SpecificationError, name="X"):
         sv.computed(crane_plan, plant, poles={"X": [1.0] * 4, "Z": [-1.0] * 4})
     for delay in (0.5, -1, "one", True):
-        with refused(sv.SpecificationError, "delay"):
+        with refused(sv.errors.SpecificationError, "delay"):
             sv.computed(crane_plan, plant, delay=delay)
-    with refused(sv.SpecificationError, "0.05 s"):
+    with refused(sv.errors.SpecificationError, "0.05 s"):
         sv.computed(crane_plan, sv.plant(plant.mechanism, delay=0.05))
-    with refused(sv.NameUnknown, name="x", match="X"):
+    with refused(sv.errors.NameUnknown, name="x", match="X"):
         sv.computed(crane_plan, plant, poles={"x": [-1.0] * 4})
-    with refused(sv.SpecificationError, "plant", "plan", plan=crane_plan.model.reduction.mechanism.q.names):
+    with refused(sv.errors.SpecificationError, "plant", "plan", plan=crane_plan.model.reduction.mechanism.q.names):
         heavier = {"actuators": {"trolley": [1, 0, 0], "hoist": [0, 0, 1]}, "parameters": plant.mechanism.parameters}
         other = sv.Mechanism(plant.mechanism.q, balance=2 * plant.mechanism.balance, **heavier)
         sv.computed(crane_plan, sv.plant(other))

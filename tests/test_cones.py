@@ -70,15 +70,15 @@ def test_a_foot_does_not_slip_where_its_cone_bounds_the_law(stand):
 
 def test_bounds_of_reactions_are_refused_by_name(stand):
     plan, plant, law, _ = stand
-    with refused(sv.NameUnknown, match="multiplier_sole_x"):
+    with refused(sv.errors.NameUnknown, match="multiplier_sole_x"):
         sv.limited(law, plant, bounds={"slip": ({"multiplier_sole_xx": 1.0}, None, 0.0)})
-    with refused(sv.SpecificationError, "slip", name="slip"):
+    with refused(sv.errors.SpecificationError, "slip", name="slip"):
         sv.limited(law, plant, bounds={"slip": ({"multiplier_sole_x": 1.0}, 1.0, 0.0)})
-    with refused(sv.SpecificationError):
+    with refused(sv.errors.SpecificationError):
         sv.limited(law, plant, bounds={"slip": ({"multiplier_sole_x": np.nan}, None, 0.0)})
-    with refused(sv.SpecificationError):
+    with refused(sv.errors.SpecificationError):
         sv.limited(law, plant, bounds={"slip": ([1.0], None, 0.0)})
-    with refused(sv.SpecificationError, "immediately"):
+    with refused(sv.errors.SpecificationError, "immediately"):
         sv.limited(law, sv.plant(plant.mechanism, lag={"side": 0.1, "lift": 0.1}), bounds=CONE)
 
 

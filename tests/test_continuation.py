@@ -153,10 +153,10 @@ def test_the_start_repeats_the_branch():
 
 
 def test_true_singularities_end_the_plan():
-    with refused(sv.SingularProgram) as caught:
+    with refused(sv.errors.SingularProgram) as caught:
         moved("through", [0.1, 2.9])
     assert caught.value.details["t"] == pytest.approx(np.pi / 4, abs=1e-6)
-    with refused(sv.SingularProgram) as caught:  # beyond the reach
+    with refused(sv.errors.SingularProgram) as caught:  # beyond the reach
         moved("away", [0.1, 2.9])
     assert caught.value.details["t"] == pytest.approx((np.sqrt(4 - 0.16) - 1) / 0.6, abs=1e-6)
     assert caught.value.details["zero"] == ["b"] and list(caught.value.run.t) == [0.1]
@@ -165,7 +165,7 @@ def test_true_singularities_end_the_plan():
 @pytest.mark.parametrize("count", [3, 201, 1001])
 def test_a_sample_without_finite_accelerations_ends_the_plan(count, backend):
     arm.cache_clear()  # a model keeps its compiled functions
-    with refused(sv.IntegrationStopped, "t = 1 s", "power") as caught:
+    with refused(sv.errors.IntegrationStopped, "t = 1 s", "power") as caught:
         sv.simulate(arm("cusp")[0], begin("cusp", 1), (0.0, 2.0), t_eval=np.linspace(0.0, 2.0, count))
     run = caught.value.run
     assert run.t[-1] < 1.0 and len(run.t) == count // 2 and np.isfinite(run.jets).all()

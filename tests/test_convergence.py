@@ -168,7 +168,7 @@ def test_projection_leaves_no_residual(method, rod):
 
 def test_projection_of_every_tenth_step_is_enough(rod):
     often, seldom = (
-        sv.simulate(*rod, (0.0, 20.0), method=sv.RungeKutta(4, step=2e-3), drift=sv.Project(every)) for every in (1, 10)
+        sv.simulate(*rod, (0.0, 20.0), method=sv.methods.RungeKutta(4, step=2e-3), drift=sv.methods.Project(every)) for every in (1, 10)
     )
     assert seldom.counters["projections"] == pytest.approx(often.counters["projections"] / 10, abs=2)
     assert max(by_quarters(seldom)) < 1e-9
@@ -202,23 +202,23 @@ def tracking(rho):
 def tracking_error(rho, drift):
     model = tracking(rho)
     start = model.start(**{name: 0.0 for name in model.state_names if name.endswith("y")})
-    run = sv.simulate(model, start, (0.0, 100.0), method=sv.RungeKutta(4, step=0.05), drift=drift)
+    run = sv.simulate(model, start, (0.0, 100.0), method=sv.methods.RungeKutta(4, step=0.05), drift=drift)
     return np.abs(run["x"] - np.sin(run.t)).max()
 
 
 @pytest.mark.parametrize(("rho", "without", "by_poles"), [(2, 2.2e-7, 2.3e-6), (4, 3.6e-4, 2.1e-7)])
 def test_poles_cost_accuracy_at_low_order_and_save_it_at_high_order(rho, without, by_poles):
     assert tracking_error(rho, None) == pytest.approx(without, rel=0.05)
-    assert tracking_error(rho, sv.Poles({"x": [-5.0] * rho})) == pytest.approx(by_poles, rel=0.05)
+    assert tracking_error(rho, sv.methods.Poles({"x": [-5.0] * rho})) == pytest.approx(by_poles, rel=0.05)
     assert tracking_error(rho, "project") < 1e-12
 
 
 def test_poles_beyond_the_stability_of_rk4_diverge():
-    assert tracking_error(2, sv.Poles({"x": [-40.0] * 2})) < 1e-3  # |λ h| = 2 < 2.785
+    assert tracking_error(2, sv.methods.Poles({"x": [-40.0] * 2})) < 1e-3  # |λ h| = 2 < 2.785
     with np.errstate(all="ignore"), warned("'x'", "-60 1/s", "0.04642 s"):
         try:
-            error = tracking_error(2, sv.Poles({"x": [-60.0] * 2}))
-        except sv.IntegrationStopped:
+            error = tracking_error(2, sv.methods.Poles({"x": [-60.0] * 2}))
+        except sv.errors.IntegrationStopped:
             error = np.inf
     assert error > 1.0
 
@@ -226,21 +226,21 @@ def test_poles_beyond_the_stability_of_rk4_diverge():
 @pytest.mark.parametrize(
     ("values", "error", "fact"),
     [
-        ({"rod": [-1.0]}, sv.SpecificationError, {"row": "rod", "count": 2}),
-        ({"rod": [-1.0, -2.0, -3.0]}, sv.SpecificationError, {"row": "rod", "count": 2}),
-        ({"rod": [-1.0 + 1.0j, -1.0 + 1.0j]}, sv.SpecificationError, "rod"),
-        ({"rood": [-1.0, -2.0]}, sv.NameUnknown, {"match": "rod"}),
+        ({"rod": [-1.0]}, sv.errors.SpecificationError, {"row": "rod", "count": 2}),
+        ({"rod": [-1.0, -2.0, -3.0]}, sv.errors.SpecificationError, {"row": "rod", "count": 2}),
+        ({"rod": [-1.0 + 1.0j, -1.0 + 1.0j]}, sv.errors.SpecificationError, "rod"),
+        ({"rood": [-1.0, -2.0]}, sv.errors.NameUnknown, {"match": "rod"}),
     ],
 )
 def test_wrong_poles_are_refused(values, error, fact, rod):
     with refused(error, fact):
-        sv.simulate(*rod, (0.0, 1.0), drift=sv.Poles(values))
+        sv.simulate(*rod, (0.0, 1.0), drift=sv.methods.Poles(values))
 
 
 def test_poles_per_row(rod):
     model, start = rod
     assert model.raised["rod"] == 2 and model.raised["cart"] == 2
-    run = sv.simulate(model, start, (0.0, 5.0), drift=sv.Poles({"rod": [-3.0 + 1.0j, -3.0 - 1.0j]}))
+    run = sv.simulate(model, start, (0.0, 5.0), drift=sv.methods.Poles({"rod": [-3.0 + 1.0j, -3.0 - 1.0j]}))
     assert run.success and "rod" in run.drift
     assert max(by_quarters(run)) < 1e-6
 
@@ -333,7 +333,7 @@ def test_runs_are_saved_and_loaded_without_pickle(name, gallery_model, tmp_path)
 
 def test_a_stopped_run_is_saved_too(gallery_model, tmp_path):
     model, scene = gallery_model("appell-hamel-squared"), gallery["appell-hamel-squared"]
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
     again = sv.load(caught.value.run.save(tmp_path / "stopped.npz"))
     assert not again.success and again.status == -1 and "speed" in again.message

@@ -24,7 +24,7 @@ def loads_or_is_refused(load, path, original):
     """Whether the file still reads as what was saved; anything but that and a ServoError fails."""
     try:
         read = load(path)
-    except sv.ServoError as error:
+    except sv.errors.ServoError as error:
         assert error.details["path"] == str(path)
         return False
     assert repr(read) == repr(original)
@@ -37,7 +37,7 @@ def test_a_file_that_was_cut_is_refused(saved, what, tmp_path):
     content, cut = path.read_bytes(), tmp_path / "cut.npz"
     for length in (0, 1, 10, len(content) // 3, len(content) // 2, len(content) - 200, len(content) - 1):
         cut.write_bytes(content[:length])
-        with refused(sv.ServoError, path=str(cut)):
+        with refused(sv.errors.ServoError, path=str(cut)):
             load(cut)
 
 
@@ -59,16 +59,16 @@ def test_flipped_bits_are_refused_or_without_effect(saved, what, tmp_path):
 def test_files_of_other_kinds_are_refused(load, content, tmp_path):
     path = tmp_path / "other.npz"
     path.write_bytes(content)
-    with refused(sv.ServoError, path=str(path)):
+    with refused(sv.errors.ServoError, path=str(path)):
         load(path)
     np.save(tmp_path / "array.npy", np.zeros(3))
     with zipfile.ZipFile(tmp_path / "texts.npz", "w") as archive:
         archive.writestr("meta.npy", "not an array")
     for name in ("array.npy", "texts.npz", "missing.npz", "."):
-        with refused(sv.ServoError):
+        with refused(sv.errors.ServoError):
             load(tmp_path / name)
     for odd in (None, 3, object()):
-        with refused(sv.SpecificationError, path=odd):
+        with refused(sv.errors.SpecificationError, path=odd):
             load(odd)
 
 
@@ -105,7 +105,7 @@ def test_a_run_that_says_something_else_is_refused(saved, what, tmp_path):
     facts, arrays = RUN[what]
     if what == "times in no order":
         arrays = {"t": np.random.default_rng(0).permutation(load(path).t)}
-    with refused(sv.ServoError, "cannot be read"):
+    with refused(sv.errors.ServoError, "cannot be read"):
         load(rewritten(path, tmp_path / "run.npz", facts, **arrays))
 
 
@@ -122,7 +122,7 @@ TABLE = {
 def test_a_study_that_says_something_else_is_refused(saved, what, tmp_path):
     path, load = saved["study"]
     facts, arrays = TABLE[what]
-    with refused(sv.ServoError, "cannot be read"):
+    with refused(sv.errors.ServoError, "cannot be read"):
         load(rewritten(path, tmp_path / "study.npz", facts, **arrays))
 
 
@@ -190,11 +190,11 @@ def test_texts_of_a_csv_are_no_formulas(tmp_path):
 def test_paths_that_no_file_can_have_are_refused(tmp_path, point_plan):
     for name in ("a\0b", "n" * 300, "\ud800"):
         for write in (STUDY.csv, STUDY.save, point_plan.save):
-            with refused(sv.SpecificationError, path=tmp_path / name):
+            with refused(sv.errors.SpecificationError, path=tmp_path / name):
                 write(tmp_path / name)
 
 
 @pytest.mark.parametrize("cases", [3, None, 1.5, object()])
 def test_cases_that_are_no_sequence_are_refused(cases):
-    with refused(sv.SpecificationError, type=type(cases).__name__):
+    with refused(sv.errors.SpecificationError, type=type(cases).__name__):
         sv.sweep(lambda m: {"r": m * m}, cases)

@@ -77,11 +77,11 @@ def test_rotors_of_a_follower_and_of_two_joints():
 
 def test_forces_whose_inertia_is_not_symmetric_are_refused():
     for robot in (sv.urdf(TWO),):
-        with refused(sv.SpecificationError, "d2ja", "d2jb"):
+        with refused(sv.errors.SpecificationError, "d2ja", "d2jb"):
             robot.mechanism(forces={"ja": -0.5 * robot.q.d(2)[1]})
     q = sv.coordinates("x y")
     S = sv.particle(q, 1.0, ca.vertcat(*q))
-    with refused(sv.SpecificationError, "d2x", "d2y"):
+    with refused(sv.errors.SpecificationError, "d2x", "d2y"):
         sv.Mechanism(q, S, forces={"x": -0.5 * q.d(2)[1]})
     both = {"x": -0.5 * q.d(2)[1], "y": -0.5 * q.d(2)[0]}
     mass = ca.evalf(sv.Mechanism(q, S, forces=both).mass)
@@ -107,7 +107,7 @@ def test_a_balance_with_gravity_or_damping_is_not_given_them_again():
         (without + gravity, {"forces": -gravity}),
         (without - m.forces, {"potential": m.potential, "forces": m.forces}),
     ):
-        with refused(sv.SpecificationError, "balance", "lift"):
+        with refused(sv.errors.SpecificationError, "balance", "lift"):
             sv.Mechanism(q, balance=balance, **beside)
     at = ca.Function("f", [q.jet(0), q.jet(1), q.jet(2)], [m.balance])
     numbers = [np.linspace(0.2, 1.1, 6), np.linspace(-1, 1, 6), np.linspace(2, -1, 6)]
@@ -133,7 +133,7 @@ def test_a_kinetic_energy_beside_a_balance_has_its_inertia(factor, different):
     kinetic = kinetic - ca.cos(th) * dx * dth if isinstance(factor, str) else factor * kinetic
     options = {"kinetic": kinetic, "balance": balance, "actuators": {"f": x}}
     if different:
-        with refused(sv.SpecificationError, components=different):
+        with refused(sv.errors.SpecificationError, components=different):
             sv.Mechanism(q, **options)
     else:
         assert sv.Mechanism(q, **options).energy.is_scalar()
@@ -144,7 +144,7 @@ def test_inertia_given_twice_is_refused(twice):
     q = sv.coordinates("x")
     a, v = q.d(2)[0], q.d(1)[0]
     given = {"gibbs": a**2, "balance": 3 * a, "mass": ca.SX(4), "kinetic": v**2}
-    with refused(sv.SpecificationError, *twice):
+    with refused(sv.errors.SpecificationError, *twice):
         sv.Mechanism(q, **{name: given[name] for name in twice})
 
 
@@ -189,7 +189,7 @@ RATES = {  # rates, moments of inertia, and whether they are those of the inerti
 def test_rates_are_those_of_a_rotation_along_the_bodys_axes(case):
     rates, moments, inertial = RATES[case]
     if inertial is not None:
-        with refused(sv.SpecificationError, "rates", inertial=inertial):
+        with refused(sv.errors.SpecificationError, "rates", inertial=inertial):
             sv.rigid_body(q, 0, moments, rates=rates)
         return
     S = sv.rigid_body(q, 0, moments, rates=rates)
@@ -219,7 +219,7 @@ def test_quasi_velocities_are_those_of_the_bodys_axes(make, right):
     if right:
         sv.rigid_body(moved, 0, J, rates=moved.w())
         return
-    with refused(sv.SpecificationError, "rates", inertial=True):
+    with refused(sv.errors.SpecificationError, "rates", inertial=True):
         sv.rigid_body(moved, 0, J, rates=moved.w())
 
 
@@ -227,7 +227,7 @@ def test_body_rates_of_a_rotation_are_taken():
     moved, R = quaternion()
     sv.rigid_body(moved, 0, J, rates=sv.body_rates(moved, R))
     sv.rigid_body(moved, 0, J, rates=R.T @ R @ ca.vertcat(*moved.w()))
-    with refused(sv.SpecificationError, "rates"):
+    with refused(sv.errors.SpecificationError, "rates"):
         sv.rigid_body(moved, 0, J, rates=R @ ca.vertcat(*moved.w()))
 
 
@@ -263,7 +263,7 @@ def test_limits_of_joints_that_are_not_driven_hold_by_themselves():
     robot = sv.urdf(bodies("base", "arm", "hand", axes=("0 1 0",) * 2, inside='<limit effort="7" velocity="5"/>'))
     plant = sv.plant(robot.mechanism(actuators=("ja",)), limits=robot.effort)
     assert plant.limits == {"torque_ja": (-7.0, 7.0)}
-    with refused(sv.NameUnknown, "torque_jc"):
+    with refused(sv.errors.NameUnknown, "torque_jc"):
         sv.plant(robot.mechanism(actuators=("ja",)), limits={"torque_jc": 1.0})
 
 
@@ -284,13 +284,13 @@ FILES = {
 @pytest.mark.parametrize("case", FILES)
 def test_files_that_say_a_thing_twice_or_of_nothing_are_refused(case):
     old, new, facts = FILES[case]
-    kind = sv.NameUnknown if "no joint" in case else sv.SpecificationError
+    kind = sv.errors.NameUnknown if "no joint" in case else sv.errors.SpecificationError
     assert old in ARM
     with refused(kind, *facts):
         sv.urdf(ARM.replace(old, new))
 
 
-@pytest.mark.parametrize("armature, kind", [({"ja": -0.1}, sv.SpecificationError), ({"jb": 1.0}, sv.NameUnknown)])
+@pytest.mark.parametrize("armature, kind", [({"ja": -0.1}, sv.errors.SpecificationError), ({"jb": 1.0}, sv.errors.NameUnknown)])
 def test_a_negative_rotor_and_one_of_no_joint_are_refused(armature, kind):
     with refused(kind, *armature):
         sv.urdf(ARM).mechanism(armature=armature)
@@ -333,7 +333,7 @@ def test_angles_of_five_digits_make_a_planar_linkage():
 
 
 def test_a_chain_a_tenth_of_a_millimetre_beside_its_plane_is_refused_with_its_gap():
-    with refused(sv.SpecificationError, "loop_z", row="loop_z") as caught:
+    with refused(sv.errors.SpecificationError, "loop_z", row="loop_z") as caught:
         four_bar("1.5708", "1.5708", 1e-4)
     assert abs(caught.value.details["value"]) == pytest.approx(1e-4, rel=1e-6) and "kind=" not in str(caught.value)
 

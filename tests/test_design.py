@@ -308,7 +308,7 @@ def test_a_search_goes_round_parameters_without_a_motion(monkeypatch):
 
 def test_parameters_without_a_motion_at_the_start_are_refused():
     model, _ = mass(lambda t, p: ca.sqrt(p.via - 0.5) * sv.paths.rest_to_rest(t, 0, 1, 2.0), via=2.0)
-    with refused(sv.InconsistentStart):
+    with refused(sv.errors.InconsistentStart):
         sv.design(model.with_parameters(via=0.4), {"via": (-5.0, 5.0)}, (0.0, 2.0))
 
 
@@ -366,7 +366,7 @@ def cart(upright):
 
 def test_unstable_motions_without_a_rest_are_refused_and_marginal_ones_designed():
     model, guess = cart(upright=True)
-    with refused(sv.UnstableInternalDynamics, "dwell"):
+    with refused(sv.errors.UnstableInternalDynamics, "dwell"):
         sv.design(model, {"v": (0.1, 0.5)}, (0.0, 3.0), guess=guess)
     model, guess = cart(upright=False)
     found = sv.design(model, {"v": (0.1, 0.5)}, (0.0, 3.0), guess=guess)
@@ -428,7 +428,7 @@ def test_a_force_that_jumps_between_knots_is_integrated():
 def test_limits_that_no_parameters_keep_are_refused_with_the_least_excess():
     model, _ = through()
     least = sv.design(model, {"via": (-1.0, 2.0)}, (0.0, 2.0), "peak").cost
-    with refused(sv.LimitExceeded, name="push") as caught:
+    with refused(sv.errors.LimitExceeded, name="push") as caught:
         sv.design(model, {"via": (-1.0, 2.0)}, (0.0, 2.0), limits={"push": 0.9 * least})
     assert caught.value.details["excess"] == pytest.approx(1.0 / 0.9 - 1.0, rel=1e-3)
 
@@ -437,22 +437,22 @@ def test_bad_input_is_refused():
     model, p = through()
     span, vary = (0.0, 2.0), {"via": (-1.0, 2.0)}
     for arguments, kind, details in (
-        (({}, span), sv.SpecificationError, {}),
-        (({"via": (1.0, 2.0)}, span), sv.SpecificationError, {"name": "via", "value": 0.9, "range": (1.0, 2.0)}),
-        (({"via": (None, 2.0)}, span), sv.SpecificationError, {"name": "via"}),
-        (({"vai": (0.0, 2.0)}, span), sv.NameUnknown, {"name": "vai", "match": "via"}),
-        ((vary, span, "energy"), sv.NameUnknown, {"name": "energy"}),
-        ((vary, span, "rms", "pull"), sv.NameUnknown, {"name": "pull"}),
-        ((vary, span, "rms", {"push": 0.0}), sv.SpecificationError, {}),
-        ((vary, span, "time"), sv.SpecificationError, {"minimise": "time"}),
-        ((vary, span, "rms", None, {"pull": 1.0}), sv.NameUnknown, {"name": "pull"}),
-        ((vary, span, "rms", None, {"push": (2.0, 1.0)}), sv.SpecificationError, {"name": "push"}),
-        ((vary, 2.0), sv.SpecificationError, {"t_span": 2.0}),
-        ((vary, (0.0, "end")), sv.SpecificationError, {}),
-        ((vary, (0.0, ca.SX.sym("T"))), sv.NameUnknown, {"name": "T"}),
-        ((vary, (0.0, -p.via)), sv.SpecificationError, {"t1": -0.9}),
+        (({}, span), sv.errors.SpecificationError, {}),
+        (({"via": (1.0, 2.0)}, span), sv.errors.SpecificationError, {"name": "via", "value": 0.9, "range": (1.0, 2.0)}),
+        (({"via": (None, 2.0)}, span), sv.errors.SpecificationError, {"name": "via"}),
+        (({"vai": (0.0, 2.0)}, span), sv.errors.NameUnknown, {"name": "vai", "match": "via"}),
+        ((vary, span, "energy"), sv.errors.NameUnknown, {"name": "energy"}),
+        ((vary, span, "rms", "pull"), sv.errors.NameUnknown, {"name": "pull"}),
+        ((vary, span, "rms", {"push": 0.0}), sv.errors.SpecificationError, {}),
+        ((vary, span, "time"), sv.errors.SpecificationError, {"minimise": "time"}),
+        ((vary, span, "rms", None, {"pull": 1.0}), sv.errors.NameUnknown, {"name": "pull"}),
+        ((vary, span, "rms", None, {"push": (2.0, 1.0)}), sv.errors.SpecificationError, {"name": "push"}),
+        ((vary, 2.0), sv.errors.SpecificationError, {"t_span": 2.0}),
+        ((vary, (0.0, "end")), sv.errors.SpecificationError, {}),
+        ((vary, (0.0, ca.SX.sym("T"))), sv.errors.NameUnknown, {"name": "T"}),
+        ((vary, (0.0, -p.via)), sv.errors.SpecificationError, {"t1": -0.9}),
     ):
         with refused(kind, **details):
             sv.design(model, *arguments)
-    with refused(sv.SpecificationError, name="model"):
+    with refused(sv.errors.SpecificationError, name="model"):
         sv.design(model.reduction, vary, span)

@@ -116,7 +116,7 @@ def test_wrong_runs_of_a_plant_do_not_pass(machine, part):
     if part == "an input":
         model = sv.simulate(machine, START, (0.0, 0.1), inputs={"trolley": 5.01 * ca.sin(t)}).model
     if part != "states":
-        with refused(sv.SpecificationError):
+        with refused(sv.errors.SpecificationError):
             sv.verify(run)
     jets = run.jets if part != "states" else run.jets * np.where(np.arange(len(run.t)) == 500, 1.001, 1.0)
     assert not sv.verify(replace(run, model=model, jets=jets, variants=(), stored={}, stored_residual={})).passed
@@ -138,17 +138,17 @@ def test_material_constraints_hold_in_a_driven_plant():
     angle = solve_ivp(swing, (0.0, 2.0), [0.0, 0.0], "DOP853", rtol=1e-12, atol=1e-13).y[0, -1]
     assert [run["x"][-1], run["y"][-1]] == pytest.approx([np.cos(angle), np.sin(angle)], abs=1e-6)
     assert sv.verify(run).passed
-    with refused(sv.InconsistentStart, "rod"):
+    with refused(sv.errors.InconsistentStart, "rod"):
         sv.simulate(plant, [1.1, 0.0, 0.0, 0.0], (0.0, 2.0))
 
 
 @pytest.mark.parametrize(("inputs", "kind", "details"), [
-    ({"winch": 1.0}, sv.NameUnknown, {"name": "winch"}),
-    ({"trolley": lambda t: math.floor(t)}, sv.SpecificationError, {}),
-    ({"trolley": "full"}, sv.SpecificationError, {"type": "str"}),
-    ({"trolley": np.nan}, sv.SpecificationError, {"what": "the input 'trolley'"}),
-    ({"trolley": [1.0, 2.0]}, sv.SpecificationError, {"entries": 2}),
-    (7.0, sv.SpecificationError, {}),
+    ({"winch": 1.0}, sv.errors.NameUnknown, {"name": "winch"}),
+    ({"trolley": lambda t: math.floor(t)}, sv.errors.SpecificationError, {}),
+    ({"trolley": "full"}, sv.errors.SpecificationError, {"type": "str"}),
+    ({"trolley": np.nan}, sv.errors.SpecificationError, {"what": "the input 'trolley'"}),
+    ({"trolley": [1.0, 2.0]}, sv.errors.SpecificationError, {"entries": 2}),
+    (7.0, sv.errors.SpecificationError, {}),
 ])  # fmt: skip
 def test_other_inputs_are_refused(machine, inputs, kind, details):
     with refused(kind, **details):
@@ -157,16 +157,16 @@ def test_other_inputs_are_refused(machine, inputs, kind, details):
 
 @pytest.mark.parametrize("option", [{"lag": {"trolley": 0.1}}, {"delay": 0.1}, {"rate_limits": {"trolley": 1.0}}])
 def test_actuators_that_do_not_act_at_once_are_refused(machine, option):
-    with refused(sv.SpecificationError, name=next(iter(option))):
+    with refused(sv.errors.SpecificationError, name=next(iter(option))):
         sv.simulate(sv.plant(machine.mechanism, **option), START, (0.0, 1.0))
 
 
 def test_simulate_says_what_it_takes(machine, gallery_model):
     for other in (machine.mechanism, 3, None):
-        with refused(sv.SpecificationError, type=type(other).__name__):
+        with refused(sv.errors.SpecificationError, type=type(other).__name__):
             sv.simulate(other, START, (0.0, 1.0))
     model = gallery_model("overhead-crane")
-    with refused(sv.SpecificationError, "inputs", type="Model"):
+    with refused(sv.errors.SpecificationError, "inputs", type="Model"):
         sv.simulate(model, model.start(), (0.0, 1.0), inputs={"trolley": 0.0})
 
 

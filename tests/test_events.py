@@ -96,10 +96,10 @@ def test_a_pendulum_turns_over():
     for sign in (1.0, -1.0):
         events = lambda t, x: abs(x[0]) - np.pi  # noqa: E731
         events.terminal = True
-        run = sv.simulate(plant, {"a": 0.0, "da": sign * speed}, (0.0, 5.0), sv.Taylor(), events=events)
+        run = sv.simulate(plant, {"a": 0.0, "da": sign * speed}, (0.0, 5.0), sv.methods.Taylor(), events=events)
         assert run.t[-1] == pytest.approx(half, abs=1e-10)
     both = [sv.Event("a", np.pi), sv.Event("a", 3 * np.pi), sv.Event("a", 9.0)]
-    run = sv.simulate(plant, {"a": 0.0, "da": speed}, (0.0, 4 * half), sv.Taylor(), events=both)
+    run = sv.simulate(plant, {"a": 0.0, "da": speed}, (0.0, 4 * half), sv.methods.Taylor(), events=both)
     assert np.concatenate(list(run.t_events.values()))[:2] == pytest.approx([half, 3 * half], abs=1e-10)
 
 
@@ -143,11 +143,11 @@ def test_events_of_a_bounded_motion():
     from test_bounded import arm
 
     model = arm(0.5)
-    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), events=sv.Event("q2", -0.2))
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), events=sv.Event("q2", -0.2))
     (times,) = whole.t_events.values()
     assert len(times) == 2
     assert [whole.state(t)[1] for t in times] == pytest.approx([-0.2, -0.2], abs=1e-10)
-    ended = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), events=sv.Event("q2", -0.2, terminal=2))
+    ended = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), events=sv.Event("q2", -0.2, terminal=2))
     assert ended.t[-1] == pytest.approx(times[1], abs=1e-12)
 
 

@@ -301,10 +301,10 @@ def test_expressions_are_extended_along_the_rays_of_invariants_that_are_spheres(
 
 def test_a_zero_quaternion_is_refused(free_body):
     zero = dict.fromkeys(("base_qx", "base_qy", "base_qz", "base_qw"), 0.0)
-    with refused(sv.SpecificationError, "length 0", "base_qw=1"):
+    with refused(sv.errors.SpecificationError, "length 0", "base_qw=1"):
         sv.held(free_body, ["body"], zero)
     m = free_body.mechanism(actuators={f"f{i}": e for i, e in enumerate(SIX)})
     model = sv.derive(m, sv.Program(sv.programs.follow_point("p", free_body.frame("body").position, (0, 0, 1))))
     for guess in (zero, {"base_qw": 0.0}):
-        with refused(sv.SpecificationError, "length 0"):
+        with refused(sv.errors.SpecificationError, "length 0"):
             model.start(guess=guess)

@@ -111,7 +111,7 @@ def test_feedforward_of_internal_dynamics_is_the_runge_kutta_run(name, gallery_m
     start = model.start(**scene.start, guess=scene.guess)
     steps, end = 50, 0.5
     with warned("unstable") if name == "vtol-centre" else contextlib.nullcontext():
-        run = sv.simulate(model, start, (0.0, end), method=sv.RungeKutta(4, step=end / steps))
+        run = sv.simulate(model, start, (0.0, end), method=sv.methods.RungeKutta(4, step=end / steps))
     with warned("plan_advance", "hyperbolic", "15.04") if name == "vtol-centre" else contextlib.nullcontext():
         plan = exported(model, tmp_path, start=start)
     names, _ = model.signals("reaction" if model.ideal else "actuation")

@@ -327,7 +327,7 @@ def test_a_law_in_c_runs_without_a_complaint_of(kind, real, tool, plan, tmp_path
 
 def test_options_of_the_export_are_refused_in_words(plan, tmp_path):
     law = sv.lqr(plan, sv.plant(CRANE))
-    with refused(sv.NameUnknown, "flaot", match="float"):
+    with refused(sv.errors.NameUnknown, "flaot", match="float"):
         sv.export_c(law, tmp_path, real="flaot")
     with refused(SpecificationError, "0"):
         sv.export_c(law, tmp_path, thinned=0.0)
@@ -385,7 +385,7 @@ def test_a_limited_law_in_floats_keeps_its_limits_and_its_loop(plan, tmp_path):
 def test_no_command_is_answered_where_limits_exclude_each_other(plan, tmp_path):
     machine = sv.plant(CRANE, limits={"trolley": 120.0, "hoist": (-1500.0, 0.0)})
     law = sv.limited(sv.lqr(plan, sv.plant(CRANE)), machine, bounds={"tension": (2000.0, None)})
-    with refused(sv.LimitExceeded, "tension"):
+    with refused(sv.errors.LimitExceeded, "tension"):
         sv.close(sv.plant(CRANE), law, plan.state(0.0), (0.0, 1.0))
     c, _ = library(law, tmp_path)
     u, z, y = np.full(2, 7.0), np.zeros(len(law.state)), plan.state(0.0)

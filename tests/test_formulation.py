@@ -100,11 +100,11 @@ def test_a_cost_is_a_study_that_saves_and_draws(joints, tmp_path):
 
 
 def test_what_has_no_formulation_with_multipliers_is_refused():
-    with refused(sv.SpecificationError, "order 3"):
+    with refused(sv.errors.SpecificationError, "order 3"):
         formulation_cost(lambda n, k: gallery["spiral"].build(), [(1, 1)])
-    with refused(sv.SpecificationError, "1 hidden"):
+    with refused(sv.errors.SpecificationError, "1 hidden"):
         formulation_cost(lambda n, k: gallery["two-cars"].build(), [(2, 1)])
-    with refused(sv.NameUnknown, name="inverse"):
+    with refused(sv.errors.NameUnknown, name="inverse"):
         formulation_cost(guided_arm, [(2, 1)], ["inverse"])
-    with refused(sv.SpecificationError, "k = 4", "k = 3"):
+    with refused(sv.errors.SpecificationError, "k = 4", "k = 3"):
         guided_arm(4, 4)

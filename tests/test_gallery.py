@@ -26,7 +26,7 @@ def motion(gallery_model):
             start, method = model.start(**scene.start, guess=scene.guess), "bounded" if name in BOUNDED else None
             try:
                 runs[name] = sv.simulate(model, start, scene.t_span, method)
-            except sv.SingularProgram as error:
+            except sv.errors.SingularProgram as error:
                 runs[name] = error
         return runs[name]
 

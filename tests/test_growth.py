@@ -164,7 +164,7 @@ def test_an_arm_of_bodies_moves_as_the_one_of_joint_angles():
     assert bodies.equations.sparse and not joints.equations.sparse
     start = bodies.start(guess=dict(zip(bodies.state_names, _bodies(q, v), strict=True)))
     other = joints.start(**dict(zip(joints.state_names, [*q, *v], strict=True)))
-    method, options = sv.Adaptive(rtol=1e-11, atol=1e-12), {"t_eval": [0.0, 0.2, 0.4], "progress": False}
+    method, options = sv.methods.Adaptive(rtol=1e-11, atol=1e-12), {"t_eval": [0.0, 0.2, 0.4], "progress": False}
     run, expected = (sv.simulate(m, x, (0.0, 0.4), method, **options) for m, x in ((bodies, start), (joints, other)))
     for i, total in enumerate(np.cumsum([expected[f"theta{k}"] for k in (1, 2, 3)], axis=0)):
         assert np.abs(run[f"phi{i + 1}"] - total).max() < 1e-8

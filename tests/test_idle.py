@@ -153,7 +153,7 @@ ABSENT = {
 @pytest.mark.parametrize("what", ABSENT)
 def test_an_absent_name_says_how_to_include_it(beside, what):
     mechanism, _, run = beside
-    with refused(sv.NameUnknown, "keep=['phi0']", left_out="phi0"):
+    with refused(sv.errors.NameUnknown, "keep=['phi0']", left_out="phi0"):
         ABSENT[what](mechanism, run)
 
 
@@ -176,7 +176,7 @@ def test_a_start_that_names_a_coordinate_includes_it(beside, named):
 
 
 def test_keep_names_coordinates():
-    with refused(sv.NameUnknown, name="phy0", match="phi0"):
+    with refused(sv.errors.NameUnknown, name="phy0", match="phi0"):
         sv.derive(*crane(1), keep=["phy0"])
 
 
@@ -227,5 +227,5 @@ def test_what_is_wrong_with_an_idle_coordinate_is_still_said(fault):
     constraints = fault.get("constraints", lambda y: {})(y)
     S = sv.particle(q, 1.0, x) + sv.particle(q, fault.get("mass", 1.0), y)
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"a": x}, constraints=constraints)
-    with pytest.raises(sv.SpecificationError):
+    with pytest.raises(sv.errors.SpecificationError):
         sv.derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}))

@@ -111,11 +111,11 @@ def test_slower_programs_keep_the_metric():
 def test_what_has_no_such_metric_is_refused():
     arm, mechanism, pose = arm_and_pose()
     some = arm.mechanism(actuators=[f"joint_{i}" for i in range(1, 7)])
-    with refused(sv.SpecificationError, "6 actuators"):
+    with refused(sv.errors.SpecificationError, "6 actuators"):
         sv.derive(some, sv.Program(dict(list(pose.items())[:3]), weights="inertia"))
-    with refused(sv.SpecificationError, "6 actuators"):
+    with refused(sv.errors.SpecificationError, "6 actuators"):
         sv.programs.wish(some)
-    with refused(sv.NameUnknown, "joint_8", match="joint_7"):
+    with refused(sv.errors.NameUnknown, "joint_8", match="joint_7"):
         sv.programs.posture(mechanism, {"joint_8": 0.0}, 1.0)
-    with refused(sv.SpecificationError, "weights"):
+    with refused(sv.errors.SpecificationError, "weights"):
         sv.Program(pose, by="ideal", weights="inertia")

@@ -77,7 +77,7 @@ def test_a_run_without_its_model_is_refused(tmp_path):
     model = sv.derive(*passive_arm())
     run = sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 0.5))
     for other, kind in ((sv.load(run.save(tmp_path / "run")), "Run"), (None, "NoneType")):
-        with refused(sv.SpecificationError, "internal_dynamics", kind):
+        with refused(sv.errors.SpecificationError, "internal_dynamics", kind):
             sv.internal_dynamics(other)
 
 
@@ -161,11 +161,11 @@ def test_multipliers_are_those_of_the_propagator_over_a_period(depth, verdict):
 def test_a_period_that_is_none_is_refused():
     model = passive(mathieu(0.6))
     run, _ = moved(model, 20.0)
-    with refused(sv.SpecificationError, "3 s", period=3.0):
+    with refused(sv.errors.SpecificationError, "3 s", period=3.0):
         sv.internal_dynamics(run, period=3.0)
-    with refused(sv.SpecificationError, "30 s", period=30.0):
+    with refused(sv.errors.SpecificationError, "30 s", period=30.0):
         sv.internal_dynamics(run, period=30.0)
-    with refused(sv.SpecificationError, "period"):
+    with refused(sv.errors.SpecificationError, "period"):
         sv.internal_dynamics(run, period=-1.0)
 
 
@@ -233,7 +233,7 @@ def test_the_plan_of_a_parametric_resonance_is_refused_by_inverse_dynamics():
     model = passive(mathieu(0.6))
     run, found = moved(model, 120.0)
     plant = sv.plant(run.model.reduction.mechanism)
-    with refused(sv.UnstableInternalDynamics, "lqr", verdict="unstable", growth=found.growth, states=("x", "dx")):
+    with refused(sv.errors.UnstableInternalDynamics, "lqr", verdict="unstable", growth=found.growth, states=("x", "dx")):
         sv.computed(run, plant)
     run, _ = moved(passive(mathieu(0.15)), 120.0)
     assert sv.computed(run, sv.plant(run.model.reduction.mechanism)).name == "computed"
@@ -258,7 +258,7 @@ def test_growth_is_that_of_a_perturbed_twin():
 
 
 def rtol_method():
-    return sv.Adaptive("DOP853", 1e-13, 1e-15)
+    return sv.methods.Adaptive("DOP853", 1e-13, 1e-15)
 
 
 def test_phases_that_drift_apart_are_no_instability():
@@ -371,7 +371,7 @@ def test_a_motion_that_grows_beyond_its_tolerance_says_how_long_it_is_good():
 
 def test_a_stopped_motion_carries_the_verdict_too():
     model = sv.derive(*passive_arm(0.6))
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 1.0))
     assert caught.value.run.internal["verdict"] == "unstable"
 
@@ -608,8 +608,8 @@ def test_what_takes_less_time_tells_first_that_growth_is_harmless(gallery_model,
 
     bound, series = "growth_bound", "quiet_by_series"
     assert judged_by(10.0, "Taylor") == ("neutral", (series,))
-    assert judged_by(10.0, sv.Taylor(2, rtol=1e-9)) == ("neutral", (bound, series))  # many steps
-    assert judged_by(0.5, sv.Taylor(2, rtol=1e-9)) == ("neutral", (bound,))
+    assert judged_by(10.0, sv.methods.Taylor(2, rtol=1e-9)) == ("neutral", (bound, series))  # many steps
+    assert judged_by(0.5, sv.methods.Taylor(2, rtol=1e-9)) == ("neutral", (bound,))
     assert judged_by(10.0, "DOP853") == ("neutral", (bound,))
 
 
@@ -617,9 +617,9 @@ def test_deviations_that_shrink_stay_in_the_tangent_space(gallery_model, monkeyp
     """Errors of differences along the constraints do not shrink: one-sided differences leave the tangent space here."""
     model, scene = gallery_model("passive-arm"), gallery["passive-arm"]
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, "Taylor")
-    assert growth.quiet_by_series(model, run, last_index(model, sv.Taylor()))
+    assert growth.quiet_by_series(model, run, last_index(model, sv.methods.Taylor()))
     monkeypatch.setattr(flow, "of_any_size", lambda *_: None)  # as where this unit alone could not be compiled
-    assert growth.quiet_by_series(model, run, last_index(model, sv.Taylor()))
+    assert growth.quiet_by_series(model, run, last_index(model, sv.methods.Taylor()))
 
 
 @pytest.mark.parametrize("length", [9.0, 20.0])

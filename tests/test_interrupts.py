@@ -45,15 +45,15 @@ def wheel_model():
     return model, model.start(**scene.start, guess=scene.guess)
 
 
-LONG = [sv.RungeKutta(4, step=2e-6), sv.RungeKutta(8, step=2e-6), "Taylor", "RadauIIA", "DOP853"]
+LONG = [sv.methods.RungeKutta(4, step=2e-6), sv.methods.RungeKutta(8, step=2e-6), "Taylor", "RadauIIA", "DOP853"]
 
 
 @pytest.mark.parametrize("method", LONG, ids=str)
 def test_an_integration_of_minutes_is_interrupted_and_kept(wheel_model, method, ctrl_c, c_compiler):
     model, start = wheel_model
-    short = sv.RungeKutta(method.order, step=1e-3) if isinstance(method, sv.RungeKutta) else method
+    short = sv.methods.RungeKutta(method.order, step=1e-3) if isinstance(method, sv.methods.RungeKutta) else method
     sv.simulate(model, start, (0.0, 0.1), short, progress=False)  # compiled
-    end = 100.0 if isinstance(method, sv.RungeKutta) else 1e6
+    end = 100.0 if isinstance(method, sv.methods.RungeKutta) else 1e6
     ctrl_c(0.2)
     run = sv.simulate(model, start, (0.0, end), method, progress=False)
     assert (run.status, run.success) == (1, False) and "interrupted" in run.message

@@ -138,7 +138,7 @@ def plain_motion(name):
 
 def motion(system, **options):
     model, start, duration, _ = system
-    method = None if model.flat else sv.Adaptive(rtol=1e-12, atol=1e-13)
+    method = None if model.flat else sv.methods.Adaptive(rtol=1e-12, atol=1e-13)
     guess = start.get("guess")
     held = {k: v for k, v in start.items() if k != "guess"}
     state = options.pop("state", None) or model.start(guess=guess, **held)

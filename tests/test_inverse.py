@@ -35,7 +35,7 @@ def test_every_scene_has_an_inverse_or_an_end(name):
     scene = gallery[name]
     mechanism, program = scene.build()
     span = (0.0, 4.0) if name == "vtol-centre" else scene.t_span
-    ends = refused(sv.SingularProgram) if name in SINGULAR_LATER else contextlib.nullcontext()
+    ends = refused(sv.errors.SingularProgram) if name in SINGULAR_LATER else contextlib.nullcontext()
     swings = warned("marginal", "dx2") if name == "two-cars-ideal" else contextlib.nullcontext()
     with ends, swings:
         run = sv.inverse(mechanism, program, span, start={**scene.guess, **scene.start})
@@ -308,7 +308,7 @@ def test_an_unstable_program_without_a_plan_names_its_verdict(monkeypatch):
     monkeypatch.setitem(IPOPT, "max_wall_time", 1e-3)
     mechanism, _ = beside(lambda x, y, v: 25 * y + x)
     x, _ = mechanism.q
-    with refused(sv.IntegrationStopped, "non-minimum phase", "errors grow", verdict="non-minimum phase"):
+    with refused(sv.errors.IntegrationStopped, "non-minimum phase", "errors grow", verdict="non-minimum phase"):
         sv.inverse(mechanism, sv.Program({"X": x - ca.sin(mechanism.q.t)}), (0.0, 10.0), start={"dy": -1 / 26})
 
 
@@ -340,7 +340,7 @@ def test_a_forward_integration_of_an_unstable_program_is_warned_about_with_its_n
 def test_the_method_of_the_verdict_by_hand_is_not_warned_about(recwarn):
     mechanism, program = gallery["passive-arm"].build()
     sv.inverse(mechanism, program, (0.0, 2.0), method="Taylor")
-    sv.inverse(mechanism, program, (0.0, 2.0), method=sv.Bounded())
+    sv.inverse(mechanism, program, (0.0, 2.0), method=sv.methods.Bounded())
     assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
 
 
@@ -358,33 +358,33 @@ def test_what_has_no_inverse_is_refused():
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={"F": x})
-    with refused(sv.NotRealisable, residuals=["x", "y"]):
+    with refused(sv.errors.NotRealisable, residuals=["x", "y"]):
         sv.inverse(mechanism, sv.Program({"x": x - q.t, "y": y}), (0.0, 1.0))
 
 
 def test_a_span_that_cuts_a_bounded_motion_short_names_the_one_of_the_path():
     mechanism, program = gallery["vtol-centre"].build()
-    with refused(sv.SpecificationError, "(0, 4)", span=(0.0, 1.0)):
+    with refused(sv.errors.SpecificationError, "(0, 4)", span=(0.0, 1.0)):
         sv.inverse(mechanism, program, (0.0, 1.0))
 
 
 @pytest.mark.parametrize(
     ("options", "kind"),
     [
-        ({"t_span": (1.0, 0.0)}, sv.SpecificationError),
-        ({"limits": {"trolly": 1.0}}, sv.NameUnknown),
-        ({"limits": {"trolley": -1.0}}, sv.SpecificationError),
-        ({"bounds": {"tensions": (0, None)}}, sv.NameUnknown),
-        ({"method": "Tailor"}, sv.NameUnknown),
-        ({"start": {"rope": 4.0}}, sv.NameUnknown),
-        ({"start": "hanging"}, sv.SpecificationError),
-        ({"start": {"l": "long"}}, sv.SpecificationError),
-        ({"start": arm(0.5).start()}, sv.SpecificationError),
-        ({"weight": -1.0}, sv.SpecificationError),
-        ({"weight": {"Y": 1.0}}, sv.NameUnknown),
-        ({"method": np.ones(3)}, sv.NameUnknown),
-        ({"mechanism": None}, sv.SpecificationError),
-        ({"program": "path"}, sv.SpecificationError),
+        ({"t_span": (1.0, 0.0)}, sv.errors.SpecificationError),
+        ({"limits": {"trolly": 1.0}}, sv.errors.NameUnknown),
+        ({"limits": {"trolley": -1.0}}, sv.errors.SpecificationError),
+        ({"bounds": {"tensions": (0, None)}}, sv.errors.NameUnknown),
+        ({"method": "Tailor"}, sv.errors.NameUnknown),
+        ({"start": {"rope": 4.0}}, sv.errors.NameUnknown),
+        ({"start": "hanging"}, sv.errors.SpecificationError),
+        ({"start": {"l": "long"}}, sv.errors.SpecificationError),
+        ({"start": arm(0.5).start()}, sv.errors.SpecificationError),
+        ({"weight": -1.0}, sv.errors.SpecificationError),
+        ({"weight": {"Y": 1.0}}, sv.errors.NameUnknown),
+        ({"method": np.ones(3)}, sv.errors.NameUnknown),
+        ({"mechanism": None}, sv.errors.SpecificationError),
+        ({"program": "path"}, sv.errors.SpecificationError),
     ],
 )
 def test_bad_arguments_are_refused(options, kind):
@@ -395,5 +395,5 @@ def test_bad_arguments_are_refused(options, kind):
 
 
 def test_a_program_without_a_start_says_why():
-    with refused(sv.InconsistentStart):
+    with refused(sv.errors.InconsistentStart):
         sv.inverse(*gallery["spiral"].build(), (0.0, 1.0))

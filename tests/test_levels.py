@@ -298,7 +298,7 @@ def test_a_recommendation_holds_at_all_instants(three):
     """The recommended motion is compared with the reference's where nothing was measured."""
     t = np.sort(np.random.default_rng(5).uniform(0.0, 4.0, 3000))
     model = PENDULA["friction"]()
-    exact = sv.simulate(model, model.start(), (0.0, 4.0), sv.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=t)
+    exact = sv.simulate(model, model.start(), (0.0, 4.0), sv.methods.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=t)
     for error in (0.5, 0.2, 1e-4, 1e-6, 1e-9):
         best = three.recommend(error=error)
         model = PENDULA[best.row["model"]]()
@@ -324,7 +324,7 @@ def test_the_front_and_the_advice_follow_from_the_rows(three):
 
 def test_a_study_of_models_is_saved_printed_and_drawn(three, tmp_path):
     again = sv.load(three.save(tmp_path / "models"))
-    assert type(again) is sv.TradeOff and repr(again) == repr(three)
+    assert type(again) is sv.types.TradeOff and repr(again) == repr(three)
     lines = repr(three).splitlines()
     assert len(lines) <= 12 and max(map(len, lines)) <= 120 and lines[4].split()[0] == "model"
     axes = three.plot(title="pendula")

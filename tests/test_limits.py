@@ -138,7 +138,7 @@ def test_limits_and_bounds_that_exclude_each_other_stop_with_both_named(crane):
     plan, mechanism = crane
     machine = sv.plant(mechanism, limits={"hoist": (-100.0, 0.0)})
     law = sv.limited(sv.lqr(plan, sv.plant(mechanism)), machine, bounds={"tension": (500.0, None)})
-    with refused(sv.LimitExceeded, "hoist -100 .. 0", "tension 500", bounds=("tension",)):
+    with refused(sv.errors.LimitExceeded, "hoist -100 .. 0", "tension 500", bounds=("tension",)):
         sv.close(machine, law, plan.state(0.0), (0.0, 1.0))
 
 
@@ -166,7 +166,7 @@ class Failing:
     def start(self):
         def law(t, y):
             if t > 0.255:
-                raise sv.LimitExceeded(f"At t = {t:g} s it is too much.")
+                raise sv.errors.LimitExceeded(f"At t = {t:g} s it is too much.")
             return {"trolley": 0.0, "hoist": -981.0}
 
         return law
@@ -178,7 +178,7 @@ def test_the_motion_before_a_limit_that_cannot_be_kept_is_in_the_error(crane, mo
     for compiled in (True, False):
         if not compiled:
             monkeypatch.setattr(type(plant.function("ode")), "native", lambda self, *_: None)
-        with pytest.raises(sv.LimitExceeded) as caught:
+        with pytest.raises(sv.errors.LimitExceeded) as caught:
             sv.close(plant, Failing(), plan.state(0.0), (0.0, 1.0), timing=sv.Timing(rate=100.0))
         run = caught.value.run
         assert run.t[-1] == pytest.approx(0.25) and not run.success and "raised LimitExceeded" in repr(run)
@@ -216,37 +216,37 @@ def test_an_estimator_predicts_from_what_was_applied(crane):
 def test_bad_input(crane):
     plan, mechanism = crane
     law, machine = sv.lqr(plan, sv.plant(mechanism)), sv.plant(mechanism, limits={"trolley": 100.0})
-    with refused(sv.SpecificationError, "limits"):
+    with refused(sv.errors.SpecificationError, "limits"):
         sv.limited(law, sv.plant(mechanism))
-    with refused(sv.NameUnknown, name="tensoin", match="tension"):
+    with refused(sv.errors.NameUnknown, name="tensoin", match="tension"):
         sv.limited(law, machine, bounds={"tensoin": (0.0, None)})
     for bound in ((0.0, 1.0, 2.0), (1.0, 0.0), (None, None), "all"):
-        with refused(sv.SpecificationError, name="tension"):
+        with refused(sv.errors.SpecificationError, name="tension"):
             sv.limited(law, machine, bounds={"tension": bound})
-    with refused(sv.NameUnknown, name="Y"):
+    with refused(sv.errors.NameUnknown, name="Y"):
         sv.limited(law, machine, priority=["Y"])
     for options in ({"weights": {"X": 1.0}, "priority": ["X"]}, {"weights": {"X": 0.0}}, {"horizon": 0.0}):
-        with pytest.raises(sv.SpecificationError):
+        with pytest.raises(sv.errors.SpecificationError):
             sv.limited(law, machine, **options)
     for priority in ("X", 3, ["X", "X"]):
-        with refused(sv.SpecificationError, "priority"):
+        with refused(sv.errors.SpecificationError, "priority"):
             sv.limited(law, machine, priority=priority)
-    with refused(sv.SpecificationError, "limited by weight"):
+    with refused(sv.errors.SpecificationError, "limited by weight"):
         sv.limited(sv.limited(law, machine), machine)
-    with refused(sv.SpecificationError, "function"):
+    with refused(sv.errors.SpecificationError, "function"):
         sv.limited(lambda t, y: [0.0, 0.0], machine)
     slow = sv.plant(mechanism, limits={"trolley": 100.0}, lag={"trolley": 0.1, "hoist": 0.1})
-    with refused(sv.SpecificationError, "trolley, hoist", name="tension"):
+    with refused(sv.errors.SpecificationError, "trolley, hoist", name="tension"):
         sv.limited(sv.lqr(plan, slow), slow, bounds={"tension": (0.0, None)})
-    with refused(sv.NameUnknown, name="trolley"):
+    with refused(sv.errors.NameUnknown, name="trolley"):
         sv.limited(sv.lqr(plan, slow), machine)
-    with refused(sv.SpecificationError, "None"):
+    with refused(sv.errors.SpecificationError, "None"):
         sv.limit_report(plan)
     run = sv.close(machine, sv.limited(law, machine), plan.state(0.0), (0.0, 0.1))
     for scene in ({}, "crane", {"t_span": (0.0, 6.0), "gues": {"l": 4.0}}):
-        with refused(sv.SpecificationError, "scene"):
+        with refused(sv.errors.SpecificationError, "scene"):
             sv.limit_report(run, scene)
-    with refused(sv.SpecificationError, "lqr, time-varying"):
+    with refused(sv.errors.SpecificationError, "lqr, time-varying"):
         sv.limit_report(sv.close(machine, law, plan.state(0.0), (0.0, 0.1)))
 
 
@@ -261,7 +261,7 @@ def test_a_handmade_law_is_limited_whatever_its_schedule(crane, columns):
     run = sv.close(machine, sv.limited(law, machine), plan.state(0.0), (0.0, 0.3))
     assert np.allclose(run["trolley"], np.minimum(100.0 * run.t, 10.0), rtol=1e-14)
     assert np.array_equal(run.command["hoist"][:10], -981.0 - np.minimum(np.arange(10), columns - 1))
-    with refused(sv.SpecificationError, "1 s", "0 s"):
+    with refused(sv.errors.SpecificationError, "1 s", "0 s"):
         sv.limited(replace(law, t0=1.0), machine)
     assert len(repr(sv.limited(law, machine)).splitlines()) <= 5, "a law's repr holds no other repr"
 

@@ -109,7 +109,7 @@ def test_reactions_are_saved_and_travel(tmp_path):
 
 def test_only_constraints_have_reactions():
     loop = sv.close(stand(), pushed, START, (0.0, 0.1), timing=sv.Timing(100.0))
-    with refused(sv.NameUnknown, match="multiplier_sole_z"):
+    with refused(sv.errors.NameUnknown, match="multiplier_sole_z"):
         loop["multiplier_sole_zz"]
-    with refused(sv.NameUnknown):
+    with refused(sv.errors.NameUnknown):
         loop["multiplier_side"]

@@ -87,9 +87,9 @@ def test_the_integral_of_an_output_is_that_of_the_residual_about_the_same_path()
     assert np.abs(runs[0].states - runs[1].states).max() < 1e-8 < 1e-3 < np.abs(runs[0].error["x"]).max()
     law = sv.lqr(plan, plant, integral={"speed": 10.0, "dphi": 10.0})
     assert law.state_names == ("integral of dphi", "integral of speed")
-    with refused(sv.SpecificationError, "order 2", "'load'", name="pull"):
+    with refused(sv.errors.SpecificationError, "order 2", "'load'", name="pull"):
         sv.lqr(plan, plant, integral={"pull": 1.0})
-    with refused(sv.NameUnknown, match="load"):
+    with refused(sv.errors.NameUnknown, match="load"):
         sv.lqr(plan, plant, integral={"lode": 1.0})
 
 
@@ -266,26 +266,26 @@ def test_what_is_out_of_reach_and_does_not_grow_is_left_alone():
     assert law.info["spectral radius at its end"] == pytest.approx(1.0, abs=1e-9)
     run = sv.close(plant, law, plan.state(0.0) + [0.1, 0.0, 0.0, 0.0], (0.0, 1.0))
     assert abs(run.error["x"][-1]) < 0.02
-    with refused(sv.ServoError, "Riccati"):
+    with refused(sv.errors.ServoError, "Riccati"):
         sv.lqr(plan, plant, varying=False)
 
 
 BAD = {
-    "Q of five": (lambda p, m: sv.lqr(p, m, Q=[1.0] * 5), sv.SpecificationError, {"shape": (5,)}),
-    "Q of text": (lambda p, m: sv.lqr(p, m, Q="large"), sv.SpecificationError, "Q"),
-    "Q of no state": (lambda p, m: sv.lqr(p, m, Q={"thet": 1.0}), sv.NameUnknown, {"match": "theta"}),
-    "negative Q": (lambda p, m: sv.lqr(p, m, Q={"x": -1.0}), sv.SpecificationError, "semidefinite"),
-    "odd Q": (lambda p, m: sv.lqr(p, m, Q=np.triu(np.ones((6, 6)))), sv.SpecificationError, "symmetric"),
-    "R of zero": (lambda p, m: sv.lqr(p, m, R=0.0), sv.SpecificationError, "definite"),
-    "R of three": (lambda p, m: sv.lqr(p, m, R=np.eye(3)), sv.SpecificationError, {"shape": (3, 3)}),
-    "R of NaN": (lambda p, m: sv.lqr(p, m, R=np.nan), sv.SpecificationError, "definite"),
-    "integral of nothing": (lambda p, m: sv.lqr(p, m, integral={"Y": 1.0}), sv.NameUnknown, {"name": "Y"}),
-    "integral of three": (lambda p, m: sv.lqr(p, m, integral=[1.0] * 3), sv.SpecificationError, {"shape": (3,)}),
-    "rate of zero": (lambda p, m: sv.lqr(p, m, rate=0.0), sv.SpecificationError, "rate"),
-    "plant of a delay": (lambda p, m: sv.lqr(p, sv.plant(CRANE, delay=0.02)), sv.SpecificationError, "0.02 s"),
-    "varying of text": (lambda p, m: sv.lqr(p, m, varying="frozen"), sv.SpecificationError, "varying='frozen'"),
-    "no plan": (lambda p, m: sv.lqr(m, m), sv.SpecificationError, "Plant"),
-    "out of reach": (lambda p, m: sv.lqr(*two_masses(-4.0)), sv.ServoError, "Riccati"),
+    "Q of five": (lambda p, m: sv.lqr(p, m, Q=[1.0] * 5), sv.errors.SpecificationError, {"shape": (5,)}),
+    "Q of text": (lambda p, m: sv.lqr(p, m, Q="large"), sv.errors.SpecificationError, "Q"),
+    "Q of no state": (lambda p, m: sv.lqr(p, m, Q={"thet": 1.0}), sv.errors.NameUnknown, {"match": "theta"}),
+    "negative Q": (lambda p, m: sv.lqr(p, m, Q={"x": -1.0}), sv.errors.SpecificationError, "semidefinite"),
+    "odd Q": (lambda p, m: sv.lqr(p, m, Q=np.triu(np.ones((6, 6)))), sv.errors.SpecificationError, "symmetric"),
+    "R of zero": (lambda p, m: sv.lqr(p, m, R=0.0), sv.errors.SpecificationError, "definite"),
+    "R of three": (lambda p, m: sv.lqr(p, m, R=np.eye(3)), sv.errors.SpecificationError, {"shape": (3, 3)}),
+    "R of NaN": (lambda p, m: sv.lqr(p, m, R=np.nan), sv.errors.SpecificationError, "definite"),
+    "integral of nothing": (lambda p, m: sv.lqr(p, m, integral={"Y": 1.0}), sv.errors.NameUnknown, {"name": "Y"}),
+    "integral of three": (lambda p, m: sv.lqr(p, m, integral=[1.0] * 3), sv.errors.SpecificationError, {"shape": (3,)}),
+    "rate of zero": (lambda p, m: sv.lqr(p, m, rate=0.0), sv.errors.SpecificationError, "rate"),
+    "plant of a delay": (lambda p, m: sv.lqr(p, sv.plant(CRANE, delay=0.02)), sv.errors.SpecificationError, "0.02 s"),
+    "varying of text": (lambda p, m: sv.lqr(p, m, varying="frozen"), sv.errors.SpecificationError, "varying='frozen'"),
+    "no plan": (lambda p, m: sv.lqr(m, m), sv.errors.SpecificationError, "Plant"),
+    "out of reach": (lambda p, m: sv.lqr(*two_masses(-4.0)), sv.errors.ServoError, "Riccati"),
 }  # fmt: skip
 
 
@@ -302,9 +302,9 @@ def test_a_residual_of_accelerations_is_not_fed_back():
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), actuators={"force": x})
     model = sv.derive(mechanism, sv.Program({"A": q.d(2)[0] - 1.0}))
     plan = sv.simulate(model, model.start(x=0.0, dx=0.0), (0.0, 1.0))
-    with refused(sv.SpecificationError, "order 0 or 1"):
+    with refused(sv.errors.SpecificationError, "order 0 or 1"):
         sv.lqr(plan, sv.plant(mechanism), integral=True)
-    with refused(sv.SpecificationError, "order 2", name="A"):
+    with refused(sv.errors.SpecificationError, "order 2", name="A"):
         sv.lqr(plan, sv.plant(mechanism), integral={"A": 1.0})
 
 
@@ -345,7 +345,7 @@ OUT_OF_REACH = {
 @pytest.mark.parametrize("how", OUT_OF_REACH)
 def test_the_mode_that_no_input_reaches_is_named_with_what_may_stay_unweighted(how, trailer):
     names = {"mode": ["psi", "phi_l", "phi_r"], "unweighted": ["phi_l", "phi_r"]}
-    with refused(sv.ServoError, "psi, phi_l, phi_r", "left motor", "'phi_l': 0", **names):
+    with refused(sv.errors.ServoError, "psi, phi_l, phi_r", "left motor", "'phi_l': 0", **names):
         sv.lqr(*trailer, **OUT_OF_REACH[how])
     advised = OUT_OF_REACH[how] | {"Q": {"phi_l": 0.0, "phi_r": 0.0}, "varying": True}
     law = sv.lqr(*trailer, **advised)
@@ -355,14 +355,14 @@ def test_the_mode_that_no_input_reaches_is_named_with_what_may_stay_unweighted(h
 
 @pytest.mark.parametrize(("stiffness", "mode"), [(-4.0, {"y", "dy"}), (-0.5, {"y", "dy"})])
 def test_a_growing_mode_out_of_reach_is_named(stiffness, mode):
-    with refused(sv.ServoError, "force", unweighted=[]) as caught:
+    with refused(sv.errors.ServoError, "force", unweighted=[]) as caught:
         sv.lqr(*two_masses(stiffness))
     assert set(caught.value.details["mode"]) == mode
 
 
 def test_a_mode_that_no_weight_sees_is_named(plan):
     """An unweighted crane: nothing asks for its place or its swing."""
-    with refused(sv.ServoError, "weight") as caught:
+    with refused(sv.errors.ServoError, "weight") as caught:
         sv.lqr(plan, sv.plant(CRANE), Q=0.0, varying=False)
     assert "x" in caught.value.details["mode"]
 

@@ -66,10 +66,10 @@ def test_parameters_in_lanes_equal_simulate(span, gallery_model, monkeypatch, c_
     with monkeypatch.context() as patch:
         in_lanes(patch)
         many = sv.simulate_many(model, start, {"M": values}, span, t_eval=np.linspace(*span, 7), executor=2)
-    each_equals_simulate(model, many, start, span, sv.Taylor())
+    each_equals_simulate(model, many, start, span, sv.methods.Taylor())
 
 
-@pytest.mark.parametrize("method", [sv.Taylor(), sv.Taylor(8, rtol=1e-5, atol=1e-7), sv.Taylor(jets=9, rtol=1e-10, atol=1e-12)])
+@pytest.mark.parametrize("method", [sv.methods.Taylor(), sv.methods.Taylor(8, rtol=1e-5, atol=1e-7), sv.methods.Taylor(jets=9, rtol=1e-10, atol=1e-12)])
 def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compiler):
     model = pendulum()
     angles = np.append(np.random.default_rng(SEED).uniform(-3, 3, 9), [0.0, np.pi])
@@ -152,7 +152,7 @@ def test_what_a_step_may_hide_stays_out_of_the_lanes(force):
     assert not lanes.fits(model)
     many = sv.simulate_many(model, {"a": [0.4, 1.3], "da": 0.0}, {"k": [0.5, 0.7]}, (0.0, 1.0), t_eval=[0.5])
     angles = [0.4, 1.3]
-    each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 1.0), sv.Taylor())
+    each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 1.0), sv.methods.Taylor())
 
 
 @pytest.mark.parametrize("force", [lambda a, t, p: -p.k * a**3, lambda a, t, p: p.k * ca.sin(3 * a) * a + ca.exp(p.k)])
@@ -165,8 +165,8 @@ def test_singular_programs_are_rows_among_others():
     scene = gallery["constant-speed-horizontal"]
     model = sv.derive(*scene.build())
     start = model.start(**scene.start, guess=scene.guess)
-    with pytest.raises(sv.SingularProgram) as caught:
-        simulated(model, start, (0.0, 10.0), sv.Taylor())
+    with pytest.raises(sv.errors.SingularProgram) as caught:
+        simulated(model, start, (0.0, 10.0), sv.methods.Taylor())
     many = sv.simulate_many(model, start, {"m": [model.numbers["m"]] * 3}, (0.0, 10.0))
     assert list(many["error"]) == ["SingularProgram"] * 3 and np.isnan(many["steps"]).all()
     assert many["message"][0] == str(caught.value)
@@ -193,7 +193,7 @@ def test_small_and_large_motions_take_the_tolerances_of_simulate(c_compiler):
     model = pendulum(lambda a, t, p: -p.k * a)
     angles = np.array([1e-9, 1e-3, 1.0, 0.0])
     many = sv.simulate_many(model, {"a": angles, "da": 0.0}, None, (0.0, 2.0))
-    each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 2.0), sv.Taylor())
+    each_equals_simulate(model, many, lambda i, one: one.start(a=angles[i], da=0.0), (0.0, 2.0), sv.methods.Taylor())
 
 
 def test_other_methods_run_one_by_one(gallery_model):
@@ -361,7 +361,7 @@ def test_motions_of_a_mechanism_as_given_stay_in_the_lanes(gallery_model, monkey
     scene, model = gallery["appell-hamel"], gallery_model("appell-hamel")
     start = model.start(**scene.start, guess=scene.guess)
     in_lanes(monkeypatch)
-    for method in (sv.Taylor(8, rtol=1e-4), sv.Taylor(20, rtol=1e-13, atol=1e-13)):
+    for method in (sv.methods.Taylor(8, rtol=1e-4), sv.methods.Taylor(20, rtol=1e-13, atol=1e-13)):
         many = sv.simulate_many(model, start, {"M": [4.0, 5.0, 6.0]}, (0.0, 2.0), method)
         assert list(many["error"]) == [""] * 3
 
@@ -448,11 +448,11 @@ def test_forces_of_a_pendulum_against_their_closed_form(c_compiler):
     model = pendulum()
     t = np.linspace(0.0, 1.0, 201)
     m = np.linspace(0.5, 2.0, 600)
-    many = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m}, (0.0, 1.0), sv.Taylor(jets=4), t_eval=t)
+    many = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m}, (0.0, 1.0), sv.methods.Taylor(jets=4), t_eval=t)
     a, da, dda = (many.trace[name] for name in ("a", "da", "d2a"))
     np.testing.assert_allclose(dda, -9.81 * np.sin(a), atol=1e-11)
     np.testing.assert_allclose(many.trace["F"], m * (np.cos(a) * dda - np.sin(a) * da**2), atol=1e-10)
-    few = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m[:2]}, (0.0, 1.0), sv.Taylor(jets=4), t_eval=t[:3])
+    few = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m[:2]}, (0.0, 1.0), sv.methods.Taylor(jets=4), t_eval=t[:3])
     d3a = -9.81 * np.cos(few.trace["a"]) * few.trace["da"]
     np.testing.assert_allclose(few.trace["d3a"], d3a, atol=1e-10)
     rate = np.cos(few.trace["a"]) * d3a - 3 * np.sin(few.trace["a"]) * few.trace["da"] * few.trace["d2a"]

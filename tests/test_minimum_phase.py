@@ -197,7 +197,7 @@ def test_several_ranges():
         q, gibbs=S, potential=ca.sin(p.w) * y**2 / 2, forces=(0, -0.5 * dy), actuators={"a": x}, parameters=p
     )
     program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)})
-    with refused(sv.SpecificationError, "keep=['y']", parameter="w", left_out=("y",)):
+    with refused(sv.errors.SpecificationError, "keep=['y']", parameter="w", left_out=("y",)):
         sv.minimum_phase(sv.derive(mechanism, program), "w", (1.0, 11.0))
     result = sv.minimum_phase(sv.derive(mechanism, program, keep=["y"]), "w", (1.0, 11.0))
     assert np.array(result.stable) == pytest.approx(np.array([(1.0, np.pi), (2 * np.pi, 3 * np.pi)]), abs=1e-8)
@@ -320,29 +320,29 @@ def test_results_print_become_plain_and_are_drawn(arm, aircraft):
 
 
 def test_bad_input(arm):
-    with refused(sv.NameUnknown, name="gamma", match="Gamma"):
+    with refused(sv.errors.NameUnknown, name="gamma", match="Gamma"):
         sv.minimum_phase(arm, "gamma", (0, 1))
     for values in ((1, 0), 0.0, "all", (0, np.nan), (0, None), (0.5, 0.5)):
-        with refused(sv.SpecificationError, name="Gamma"):
+        with refused(sv.errors.SpecificationError, name="Gamma"):
             sv.minimum_phase(arm, "Gamma", values)
-    with refused(sv.SpecificationError, type="dict"):
+    with refused(sv.errors.SpecificationError, type="dict"):
         sv.minimum_phase(arm, "Gamma", (0, 1), at={"q1": 0.0})
-    with refused(sv.SpecificationError, type="str"):
+    with refused(sv.errors.SpecificationError, type="str"):
         sv.minimum_phase("arm", "Gamma", (0, 1))
     result = sv.minimum_phase(arm, "Gamma", (0, 1))
     for value in ("0.5", None, np.nan):
         for call in (result.eigenvalues, result.lost):
-            with refused(sv.SpecificationError, "Gamma"):
+            with refused(sv.errors.SpecificationError, "Gamma"):
                 call(value)
 
 
 def test_states_that_are_no_equilibria_are_refused(arm):
-    with refused(sv.InconsistentStart, "q2", t=0.0) as caught:
+    with refused(sv.errors.InconsistentStart, "q2", t=0.0) as caught:
         sv.minimum_phase(arm, "Gamma", (0, 1), at=arm.start(q2=0.3))
     assert caught.value.details["equilibrium"]["q2"] == pytest.approx(0.0, abs=1e-12)
-    with refused(sv.InconsistentStart, t=0.0):
+    with refused(sv.errors.InconsistentStart, t=0.0):
         sv.minimum_phase(arm, "Gamma", (0, 1), at=arm.start(dq2=0.1))
-    with refused(sv.InconsistentStart, "moves", t=1.0):
+    with refused(sv.errors.InconsistentStart, "moves", t=1.0):
         sv.minimum_phase(arm, "Gamma", (0, 1), at=arm.start(1.0))
     at_end = sv.minimum_phase(arm, "Gamma", (0, 1), at=arm.start(2.0, q2=0.0))
     assert at_end.stable[0][1] == pytest.approx(0.4, abs=1e-12)
@@ -351,14 +351,14 @@ def test_states_that_are_no_equilibria_are_refused(arm):
 def test_programs_without_actuators_are_refused():
     mechanism, program = passive_arm()
     ideal = sv.derive(mechanism, sv.Program(program.residuals, by="ideal"))
-    with refused(sv.SpecificationError, by="ideal"):
+    with refused(sv.errors.SpecificationError, by="ideal"):
         sv.minimum_phase(ideal, "Gamma", (0, 1))
 
 
 def test_rests_that_form_no_curve_are_refused():
     model = chain(4, 0.2)
     result = sv.minimum_phase(model, "w", (0.0, 0.5))
-    with refused(sv.SpecificationError, free=3):
+    with refused(sv.errors.SpecificationError, free=3):
         result.lost(0.2)
 
 
@@ -372,7 +372,7 @@ def test_a_flat_scene_has_no_internal_states_for_any_value():
 def test_moved_states_within_1e_6_are_equilibria(arm):
     near = sv.minimum_phase(arm, "Gamma", (0.1, 0.2), at=arm.start(q2=5e-7))
     assert near.stable == ((0.1, 0.2),)
-    with refused(sv.InconsistentStart):
+    with refused(sv.errors.InconsistentStart):
         sv.minimum_phase(arm, "Gamma", (0.1, 0.2), at=arm.start(q2=5e-6))
 
 

@@ -155,7 +155,7 @@ def a_gradient_that_vanishes():
 def test_a_rank_that_is_lost_after_a_long_way_is_lost(method):
     """(x - 20) y' = cos t at x = 1 + 8 t: a gradient that falls to zero linearly, at 19/8 s."""
     model = a_gradient_that_vanishes()
-    with pytest.raises(sv.SingularProgram) as error:
+    with pytest.raises(sv.errors.SingularProgram) as error:
         sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), method)
     assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3)
 
@@ -196,6 +196,6 @@ def test_steps_that_miss_the_equations_where_the_rank_is_lost_end_the_motion(mon
         return 0, stretch.t[0] + tries[-1] / 10
 
     monkeypatch.setattr(BulkSteps, "_doubted", doubted)
-    with pytest.raises(sv.SingularProgram) as error:
+    with pytest.raises(sv.errors.SingularProgram) as error:
         sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), "DOP853")
     assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3) and tries

@@ -36,7 +36,7 @@ def test_a_motion_is_cut_before_an_instant(end, left):
     assert motion.variants() == [(0, min(3, len(left)), "a"), (3, len(left), "b")][: (len(left) > 0) + (len(left) > 3)]
 
 
-@pytest.mark.parametrize("method", [None, "Taylor", "RadauIIA", sv.RungeKutta(4, step=3e-4)], ids=str)
+@pytest.mark.parametrize("method", [None, "Taylor", "RadauIIA", sv.methods.RungeKutta(4, step=3e-4)], ids=str)
 def test_samples_are_not_copied_when_a_motion_ends(method, wheel, gallery_model, monkeypatch):
     """Also many of them, so that who interrupts a long motion does not wait."""
     model, start = wheel
@@ -58,7 +58,7 @@ def test_fixed_steps_end_at_the_end_of_the_span_and_at_knots(end):
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
     path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, t_start=0.7, duration=2.1)
     model = sv.derive(mechanism, sv.Program({"p": q.dt(y + x / 2 - path)}, by="ideal"))
-    run = sv.simulate(model, model.start(x=0.0, y=0.0, dx=0.0), (0.0, end), sv.RungeKutta(4, step=0.01))
+    run = sv.simulate(model, model.start(x=0.0, y=0.0, dx=0.0), (0.0, end), sv.methods.RungeKutta(4, step=0.01))
     assert run.t[-1] == end and np.all(np.diff(run.t) > 0.009)
     assert {knot for knot in run.knots if knot < end} <= {*run.t}
 
@@ -81,7 +81,7 @@ def test_motions_from_one_start_derive_their_variants_once(monkeypatch):
     start = model.start(guess=scene.guess, **scene.start)
     derived, places = models._derived, []
     monkeypatch.setattr(models, "_derived", lambda *given: places.append(given[3]) or derived(*given))
-    runs = [sv.simulate(model, start, scene.t_span, sv.RungeKutta(4, step=1e-2)) for _ in range(2)]
+    runs = [sv.simulate(model, start, scene.t_span, sv.methods.RungeKutta(4, step=1e-2)) for _ in range(2)]
     assert len(places) == runs[0].counters["pivot_changes"] > 0
     assert np.array_equal(*(run.jets for run in runs))
     assert runs[0].variants[-1][2] is runs[1].variants[-1][2]

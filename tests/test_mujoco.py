@@ -107,16 +107,16 @@ def test_what_mujoco_cannot_run_is_refused():
     plant = sv.plant(mechanism)
     law, start, file = sv.lqr(run, plant, rate=1000.0), model.start(guess=HOME), robots.file_of("six_axis_arm")
     other = model_of("six_axis_arm", step=3e-4)
-    with refused(sv.SpecificationError, "0.0003", "timestep", timestep=3e-4):
+    with refused(sv.errors.SpecificationError, "0.0003", "timestep", timestep=3e-4):
         sv.interop.mujoco(other, law, start, (0.0, 1.0))
-    with refused(sv.NameUnknown, "pan"):
+    with refused(sv.errors.NameUnknown, "pan"):
         sv.interop.mujoco(robots.file_of("pendubot"), law, start, (0.0, 1.0))
-    with refused(sv.SpecificationError, "cannot read"):
+    with refused(sv.errors.SpecificationError, "cannot read"):
         sv.interop.mujoco("<mujoco><nonsense/></mujoco>", law, start, (0.0, 1.0))
-    with refused(sv.SpecificationError, "lag", lag=["torque_pan"]):
+    with refused(sv.errors.SpecificationError, "lag", lag=["torque_pan"]):
         lagging = sv.plant(mechanism, lag={"torque_pan": 0.01})
         sv.interop.mujoco(file, law, start, (0.0, 1.0), plant=lagging)
-    with refused(sv.SpecificationError, "plant"):
+    with refused(sv.errors.SpecificationError, "plant"):
         sv.interop.mujoco(file, lambda t, y: {}, start, (0.0, 1.0), timing=sv.Timing(rate=100.0))
 
 
@@ -139,6 +139,6 @@ def test_joints_whose_names_were_taken_are_found():
     theirs = sv.interop.mujoco(model, idle, start, (0.0, 0.2), plant=plant, timing=timing)
     ours = sv.close(plant, idle, start, (0.0, 0.2), timing=timing)
     assert np.abs(theirs.states - ours.states).max() < 1e-12
-    with refused(sv.SpecificationError, "a.b", coordinates=["a_b", "a_b_"]):
+    with refused(sv.errors.SpecificationError, "a.b", coordinates=["a_b", "a_b_"]):
         other = sv.plant(sv.urdf(two_links("a.b", "a_b")).mechanism())
         sv.interop.mujoco(two_links("a.b", "a_b"), idle, [0.0] * 4, (0.0, 0.2), plant=other, timing=timing)

@@ -146,22 +146,22 @@ def test_a_filter_on_constrained_states_is_that_of_their_tangent_spaces():
 def test_bad_input(crane):
     plan, nominal, _ = crane
     law = sv.lqr(plan, nominal)
-    with refused(sv.NameUnknown, name="tetha", match="theta"):
+    with refused(sv.errors.NameUnknown, name="tetha", match="theta"):
         sv.output_feedback(law, nominal, {"tetha": 1e-3})
     for noise in ({}, None, {"x": 0.0}):
-        with pytest.raises(sv.SpecificationError):
+        with pytest.raises(sv.errors.SpecificationError):
             sv.output_feedback(law, nominal, noise)
-    with refused(sv.SpecificationError, "feedforward"):
+    with refused(sv.errors.SpecificationError, "feedforward"):
         sv.output_feedback(sv.feedforward(plan, nominal), nominal, SENSORS)
-    with refused(sv.SpecificationError, "output feedback"):
+    with refused(sv.errors.SpecificationError, "output feedback"):
         sv.output_feedback(sv.output_feedback(law, nominal, SENSORS), nominal, SENSORS)
     slow = sv.plant(nominal.mechanism, lag={"trolley": 0.05})
     for pair in ((law, slow), (sv.lqr(plan, slow), nominal)):
-        with refused(sv.SpecificationError, "trolley"):
+        with refused(sv.errors.SpecificationError, "trolley"):
             sv.output_feedback(*pair, SENSORS)
-    with refused(sv.SpecificationError, "0.05 s"):
+    with refused(sv.errors.SpecificationError, "0.05 s"):
         sv.output_feedback(law, sv.plant(nominal.mechanism, delay=0.05), SENSORS)
-    with refused(sv.ServoError, "Riccati"):
+    with refused(sv.errors.ServoError, "Riccati"):
         sv.output_feedback(law, nominal, {"dx": 1e-3})
 
 
@@ -170,5 +170,5 @@ def test_velocities_alone_do_not_tell_where_an_arm_without_gravity_is():
     model = sv.derive(mechanism, program).with_parameters(g=0.0)
     plan = sv.simulate(model, model.start(guess={"q1": -0.4, "q2": 1.5}), (0.0, 2.0))
     nominal = sv.plant(mechanism, g=0.0)
-    with refused(sv.ServoError, "Riccati"):
+    with refused(sv.errors.ServoError, "Riccati"):
         sv.output_feedback(sv.lqr(plan, nominal), nominal, {"dq1": 1e-3, "dq2": 1e-3})

@@ -50,7 +50,7 @@ def motions(t, m1=2.0):
 
 
 def test_runs_read_the_closed_forms_by_each_name(plan, tmp_path):
-    run = sv.simulate(plan.model, plan.start, SPAN, sv.Taylor(jets=3), t_eval=plan.t)
+    run = sv.simulate(plan.model, plan.start, SPAN, sv.methods.Taylor(jets=3), t_eval=plan.t)
     for name, values in motions(run.t).items():
         assert np.abs(run[name] - values).max() < 1e-9, name
     for name in ("x", "x_residual"):
@@ -62,9 +62,9 @@ def test_runs_read_the_closed_forms_by_each_name(plan, tmp_path):
     header, first, *_ = run.csv(tmp_path / "run.csv").read_text().splitlines()
     row = dict(zip(re.findall(r"[\w ]+(?= \[|,|$)", header), map(float, first.split(",")), strict=False))
     assert len(row) > 5 and (row["x"], row["x_input"], row["x_output"]) == pytest.approx((1.0, -2.0, 1.0))
-    with refused(sv.NameUnknown, "x_residual", match="x_input"):
+    with refused(sv.errors.NameUnknown, "x_residual", match="x_input"):
         run["x_inputs"]
-    with refused(sv.NameUnknown, "m1_residual", match="m1_input"):
+    with refused(sv.errors.NameUnknown, "m1_residual", match="m1_input"):
         run["m1_inpt"]
 
 
@@ -126,9 +126,9 @@ def test_residuals_have_bounds_by_their_longer_name():
     most = np.abs(free["m1_residual"]).max() / 2
     run = sv.relaxed(plant, program, SPAN, weight=1e-3, bounds={"m1_residual": most})
     assert np.abs(run["m1_residual"]).max() == pytest.approx(most, rel=1e-2)
-    with refused(sv.SpecificationError, "limits", name="x_input"):
+    with refused(sv.errors.SpecificationError, "limits", name="x_input"):
         sv.relaxed(plant, program, SPAN, bounds={"x_input": 1.0})
-    with refused(sv.NameUnknown, match="x_residual"):
+    with refused(sv.errors.NameUnknown, match="x_residual"):
         sv.relaxed(plant, program, SPAN, bounds={"x_residua": 1.0})
 
 
@@ -171,9 +171,9 @@ def test_actuators_go_by_either_name_where_nothing_else_is_meant(plan):
     assert all(np.abs(run["x"] - run.t**2 / 4).max() < 1e-9 for run in driven)
     at_once = sv.inverse(mechanism, plan.model.reduction.program, SPAN, limits={"x": 3.0, "dm1": 9.0})
     assert np.abs(at_once["x_input"]).max() == pytest.approx(2.0)
-    with refused(sv.SpecificationError, "twice", name="x_input"):
+    with refused(sv.errors.SpecificationError, "twice", name="x_input"):
         sv.plant(mechanism, limits={"x_input": 1.0, "x": 2.0})
-    with refused(sv.NameUnknown, valid=("x_input", "m1_input")):
+    with refused(sv.errors.NameUnknown, valid=("x_input", "m1_input")):
         sv.plant(mechanism, limits={"y": 1.0})
 
 
@@ -198,7 +198,7 @@ def test_parameters_go_by_their_longer_name_among_initial_values(plan):
     found = sv.sensitivity(plan, of=["x", "x_input", "x_output"], to="m1_parameter")
     for name, slope in (("x", 0.0), ("x_input", -np.cos(plan.t)), ("x_output", 0.0)):
         assert np.abs(found[name, "m1_parameter"] - slope).max() < 1e-9, name
-    with refused(sv.SpecificationError):  # the initial value of the coordinate, which the program determines
+    with refused(sv.errors.SpecificationError):  # the initial value of the coordinate, which the program determines
         sv.sensitivity(plan, of="x_input", to="m1")
     assert model.numbers == {"m1_parameter": 2.0, "m2": 3.0}
     assert model.with_parameters(m1=4.0) == model.with_parameters(m1_parameter=4.0) != model
@@ -207,7 +207,7 @@ def test_parameters_go_by_their_longer_name_among_initial_values(plan):
         for name, values in motions(plan.t, m1).items():
             if not name.startswith("dx_"):
                 assert np.abs(many.trace[name][:, i] - values).max() < 1e-9, name
-    with refused(sv.SpecificationError, "twice", name="m1_parameter"):
+    with refused(sv.errors.SpecificationError, "twice", name="m1_parameter"):
         model.with_parameters(m1=1.0, m1_parameter=2.0)
 
 
@@ -319,7 +319,7 @@ def test_only_what_stays_ambiguous_is_refused(given):
     parts = {k: {n: q[i] for n, i in v.items()} for k, v in given.items() if k != "names"}
     S, p = sv.particle(q, 1.0, q), sv.parameters(m1=1.0)
     first = given["names"].split()[0]
-    with refused(sv.SpecificationError, "is taken"):
+    with refused(sv.errors.SpecificationError, "is taken"):
         mechanism = sv.Mechanism(q, S, parameters=p, **{"actuators": {"F": q[0], "G": q[1]}} | parts)
         sv.derive(mechanism, sv.Program({first: q[0] - ca.cos(q.t), "other": q[1]}))
 
@@ -363,7 +363,7 @@ def test_coordinates_are_read_by_name_and_by_place():
     assert [s.name() for s in (q["y"], q[0], q[-1], *q[:2], *q.d(1)[1:])] == ["y", "x", "z", "x", "y", "dy", "dz"]
     assert (2 * q.d(1)).shape == (3, 1) == (q.d(1) + q.d(2)).shape
     for place in (3, -4, "w", True, None):
-        with refused(sv.NameUnknown, "x, y, z", name=place):
+        with refused(sv.errors.NameUnknown, "x, y, z", name=place):
             q[place]
     with pytest.raises(TypeError):
         q.d(1)[0] = 1.0

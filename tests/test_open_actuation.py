@@ -93,7 +93,7 @@ def test_quasi_velocities_do_not_change_the_actuation():
         ),
     }
     t_eval = np.linspace(0.0, 2.5, 26)
-    method = sv.Adaptive(rtol=1e-11, atol=1e-12)
+    method = sv.methods.Adaptive(rtol=1e-11, atol=1e-12)
     runs = {}
     for name, frame in {"plain": None, **frames}.items():
         model = sv.derive(*arm({"elbow": 2.0}, posture, frame=frame))
@@ -108,7 +108,7 @@ def test_quasi_velocities_do_not_change_the_actuation():
 def precise():
     """The arm's motion by an integration that is finer than those compared with it."""
     model = sv.derive(*arm({"elbow": 2.0}, posture))
-    method, t_eval = sv.Adaptive(rtol=1e-12, atol=1e-13), np.linspace(0.0, 2.5, 11)
+    method, t_eval = sv.methods.Adaptive(rtol=1e-12, atol=1e-13), np.linspace(0.0, 2.5, 11)
     return sv.simulate(model, elbow_up(model), (0.0, 2.5), method, t_eval=t_eval)
 
 
@@ -166,7 +166,7 @@ def test_the_choice_follows_hidden_rows_where_the_decoupling_is_singular(weights
                       guess={"l": 4.0, "Z": 4.0} if rope == "redundant" else {"l": 4.0})  # fmt: skip
     assert model.free == 2 and len(model.reduction.hidden) == 1
     start = model.start(guess={"l": 4.0, "Z": 4.0} if rope == "redundant" else {"l": 4.0}, s=0.2)
-    run = sv.simulate(model, start, (0.0, 6.0), sv.Adaptive(rtol=1e-11, atol=1e-12), t_eval=np.linspace(0.0, 6.0, 61))
+    run = sv.simulate(model, start, (0.0, 6.0), sv.methods.Adaptive(rtol=1e-11, atol=1e-12), t_eval=np.linspace(0.0, 6.0, 61))
     one = sv.simulate(crane_plan.model, crane_plan.model.start(guess={"l": 4.0}), (0.0, 6.0), t_eval=run.t)
     expected = share(one["trolley"], weights, {"cart": -40.0 * run["ds"] - 30.0 * run["s"]})
     for name, values in expected.items():
@@ -370,7 +370,7 @@ def test_rows_that_no_actuator_moves_stay_refused():
 def test_a_rank_that_falls_along_the_motion_ends_it():
     """The arm is pulled straight: beyond 3 m there is no actuation, and none is handed out."""
     model = sv.derive(*arm(None, damping, end=(2.6, 1.9)))
-    with pytest.raises(sv.ServoError) as caught:
+    with pytest.raises(sv.errors.ServoError) as caught:
         sv.simulate(model, elbow_up(model), (0.0, 3.0))
     assert caught.value.run is not None and 0.3 < caught.value.run.t[-1] < 2.0
     reach = np.hypot(1.5 + 1.1, 1.0 + 0.9)

@@ -66,7 +66,7 @@ def model(request, gallery_model):
 @pytest.fixture(scope="module")
 def run(gallery_model):
     model = gallery_model("appell-hamel")
-    return sv.simulate(model, model.start(**START), (0.0, 2.0), sv.Adaptive(rtol=1e-12, atol=1e-13))
+    return sv.simulate(model, model.start(**START), (0.0, 2.0), sv.methods.Adaptive(rtol=1e-12, atol=1e-13))
 
 
 def test_random_states_satisfy_the_program(model):
@@ -147,7 +147,7 @@ def test_4_7_read_with_velocities_where_it_means_accelerations_is_refused():
     accelerations, rates = ca.vertcat(*q.d(2)[:3]), q.d(1)[3:]
     S = p.m * ca.dot(accelerations, accelerations) / 2 + (p.I_y + p.a**2 * p.M) * rates[0] ** 2 / 2
     S += p.I_x * rates[1] ** 2 / 2  # the last two terms as printed
-    with refused(sv.SpecificationError, names=["dphi"]):
+    with refused(sv.errors.SpecificationError, names=["dphi"]):
         sv.derive(sv.Mechanism(q, gibbs=S, potential=-p.m * p.g * q.d(0)[2], parameters=p), program)
 
 

@@ -95,7 +95,7 @@ def test_without_work_an_ellipse_in_gravity_is_a_bead_on_a_wire():
 
 def test_a_law_of_power_ends_where_the_mass_turns_back():
     model, begin = along(ellipse, power(0.0, G), G, s=-1.4, ds=1.0)
-    with refused(sv.SingularProgram, "law"):
+    with refused(sv.errors.SingularProgram, "law"):
         sv.simulate(model, begin, (0.0, 3.0))
 
 
@@ -145,5 +145,5 @@ def test_a_parameter_without_inertia_is_refused_with_the_remedy():
     x, y, s = q
     mechanism = sv.Mechanism(q, sv.particle(q, M, (x, y)), actuators={"fx": x, "fy": y})
     place = circle(s)
-    with refused(sv.SpecificationError, "parameter of a path", names=["ds"]):
+    with refused(sv.errors.SpecificationError, "parameter of a path", names=["ds"]):
         sv.derive(mechanism, sv.Program({"X": x - place[0], "Y": y - place[1]}))

@@ -235,7 +235,7 @@ def test_operations_through_parameters_are_in_proportion_to_their_number():
 
 def test_a_spline_through_parameters_at_very_uneven_times_is_refused():
     times = np.cumsum(np.array([1.0, 1e-9, 1.0, 1.0, 1e-9, 1.0, 1.0, 1.0, 1e-9, 1.0]))
-    with refused(sv.SpecificationError, degree=13):
+    with refused(sv.errors.SpecificationError, degree=13):
         paths.spline(T, times, ca.SX.sym("points", len(times)), 6)
 
 

@@ -139,7 +139,7 @@ def on_the_circle(order):
 def test_pivots_change_without_a_derivation(order, method, counted):
     model, start = on_the_circle(order)
     counted["derived"] = 0
-    run = sv.simulate(model, start, (0.0, 12.0), sv.RungeKutta(4, step=4e-3) if method == "RK4" else method)
+    run = sv.simulate(model, start, (0.0, 12.0), sv.methods.RungeKutta(4, step=4e-3) if method == "RK4" else method)
     variants = {id(variant) for *_, variant in run.variants}
     assert counted["derived"] == 0 and run.counters["pivot_changes"] >= 5 and len(variants) <= 4
     assert max(np.abs(run.residual[name]).max() for name in ("X", "Y")) < 1e-6

@@ -57,7 +57,7 @@ def test_masses_that_are_none_are_refused(load, facts):
         lambda: sv.plant(own),
         lambda: sv.derive(own, sv.Program({"X": x - q.t})),
     ):
-        with refused(sv.SpecificationError, *facts):
+        with refused(sv.errors.SpecificationError, *facts):
             build()
 
 
@@ -156,31 +156,31 @@ def test_a_plant_takes_states_by_name_and_as_arrays():
 
 
 BAD = {
-    "no mechanism": (lambda: sv.plant("crane"), sv.SpecificationError, "Mechanism"),
-    "unknown parameter": (lambda: sv.plant(RELATIVE, m_lod=115.0), sv.NameUnknown, {"match": "m_load"}),
-    "infinite parameter": (lambda: sv.plant(RELATIVE, m_load=np.inf), sv.SpecificationError, {"name": "m_load"}),
-    "limit of no actuator": (lambda: sv.plant(RELATIVE, limits={"troley": 5.0}), sv.NameUnknown, {"match": "trolley"}),
-    "limits reversed": (lambda: sv.plant(RELATIVE, limits={"trolley": (5.0, -5.0)}), sv.SpecificationError, "(5.0, -5.0)"),
-    "limit open on both sides": (lambda: sv.plant(RELATIVE, limits={"trolley": (None, np.inf)}), sv.SpecificationError, "inf"),
-    "limit of text": (lambda: sv.plant(RELATIVE, limits={"trolley": "five"}), sv.SpecificationError, "'five'"),
-    "negative rate": (lambda: sv.plant(RELATIVE, rate_limits={"trolley": -1.0}), sv.SpecificationError, {"name": "trolley"}),
-    "negative lag": (lambda: sv.plant(RELATIVE, lag={"trolley": -1.0}), sv.SpecificationError, {"name": "trolley"}),
-    "negative delay": (lambda: sv.plant(RELATIVE, delay=-0.1), sv.SpecificationError, "-0.1"),
-    "negative damping": (lambda: sv.plant(RELATIVE, damping={"x": -5.0}), sv.SpecificationError, {"name": "x"}),
-    "damped nothing": (lambda: sv.plant(RELATIVE, damping={"thet": 5.0}), sv.NameUnknown, {"match": "theta"}),
-    "force on nothing": (lambda: sv.plant(RELATIVE, forces={"y": 1.0}), sv.NameUnknown, {"valid": ("x", "l", "theta")}),
-    "force of a stranger": (lambda: sv.plant(RELATIVE, forces={"x": ca.SX.sym("v")}), sv.SpecificationError, {"name": "v"}),
+    "no mechanism": (lambda: sv.plant("crane"), sv.errors.SpecificationError, "Mechanism"),
+    "unknown parameter": (lambda: sv.plant(RELATIVE, m_lod=115.0), sv.errors.NameUnknown, {"match": "m_load"}),
+    "infinite parameter": (lambda: sv.plant(RELATIVE, m_load=np.inf), sv.errors.SpecificationError, {"name": "m_load"}),
+    "limit of no actuator": (lambda: sv.plant(RELATIVE, limits={"troley": 5.0}), sv.errors.NameUnknown, {"match": "trolley"}),
+    "limits reversed": (lambda: sv.plant(RELATIVE, limits={"trolley": (5.0, -5.0)}), sv.errors.SpecificationError, "(5.0, -5.0)"),
+    "limit open on both sides": (lambda: sv.plant(RELATIVE, limits={"trolley": (None, np.inf)}), sv.errors.SpecificationError, "inf"),
+    "limit of text": (lambda: sv.plant(RELATIVE, limits={"trolley": "five"}), sv.errors.SpecificationError, "'five'"),
+    "negative rate": (lambda: sv.plant(RELATIVE, rate_limits={"trolley": -1.0}), sv.errors.SpecificationError, {"name": "trolley"}),
+    "negative lag": (lambda: sv.plant(RELATIVE, lag={"trolley": -1.0}), sv.errors.SpecificationError, {"name": "trolley"}),
+    "negative delay": (lambda: sv.plant(RELATIVE, delay=-0.1), sv.errors.SpecificationError, "-0.1"),
+    "negative damping": (lambda: sv.plant(RELATIVE, damping={"x": -5.0}), sv.errors.SpecificationError, {"name": "x"}),
+    "damped nothing": (lambda: sv.plant(RELATIVE, damping={"thet": 5.0}), sv.errors.NameUnknown, {"match": "theta"}),
+    "force on nothing": (lambda: sv.plant(RELATIVE, forces={"y": 1.0}), sv.errors.NameUnknown, {"valid": ("x", "l", "theta")}),
+    "force of a stranger": (lambda: sv.plant(RELATIVE, forces={"x": ca.SX.sym("v")}), sv.errors.SpecificationError, {"name": "v"}),
     "force of accelerations": (
-        lambda: sv.plant(RELATIVE, forces={"x": RELATIVE.q.d(2)[0]}), sv.SpecificationError, "accelerations",
+        lambda: sv.plant(RELATIVE, forces={"x": RELATIVE.q.d(2)[0]}), sv.errors.SpecificationError, "accelerations",
     ),
-    "state too short": (lambda: sv.plant(RELATIVE).state(np.zeros(5)), sv.SpecificationError, {"size": 5}),
-    "state of no name": (lambda: sv.plant(RELATIVE).state({"y": 1.0}), sv.NameUnknown, {"name": "y"}),
-    "state incomplete": (lambda: sv.plant(RELATIVE).state({"x": 1.0}), sv.SpecificationError, {"missing": ["l", "theta", "dx", "dl", "dtheta"]}),
-    "function": (lambda: sv.plant(RELATIVE).function("odd"), sv.NameUnknown, {"name": "odd"}),
-    "gust backwards": (lambda: sv.disturbances.gust(1.0, 2.0, 1.0), sv.SpecificationError, "from 2 to 1 s"),
-    "gust of edges": (lambda: sv.disturbances.gust(1.0, 1.0, 2.0, rise=0.6), sv.SpecificationError, "0.6 s"),
-    "noise of no seed": (lambda: sv.disturbances.noise(1.0, 5.0, seed=-1), sv.SpecificationError, "seed=-1"),
-    "noise of no band": (lambda: sv.disturbances.noise(1.0, 0.0), sv.SpecificationError, "0 Hz"),
+    "state too short": (lambda: sv.plant(RELATIVE).state(np.zeros(5)), sv.errors.SpecificationError, {"size": 5}),
+    "state of no name": (lambda: sv.plant(RELATIVE).state({"y": 1.0}), sv.errors.NameUnknown, {"name": "y"}),
+    "state incomplete": (lambda: sv.plant(RELATIVE).state({"x": 1.0}), sv.errors.SpecificationError, {"missing": ["l", "theta", "dx", "dl", "dtheta"]}),
+    "function": (lambda: sv.plant(RELATIVE).function("odd"), sv.errors.NameUnknown, {"name": "odd"}),
+    "gust backwards": (lambda: sv.disturbances.gust(1.0, 2.0, 1.0), sv.errors.SpecificationError, "from 2 to 1 s"),
+    "gust of edges": (lambda: sv.disturbances.gust(1.0, 1.0, 2.0, rise=0.6), sv.errors.SpecificationError, "0.6 s"),
+    "noise of no seed": (lambda: sv.disturbances.noise(1.0, 5.0, seed=-1), sv.errors.SpecificationError, "seed=-1"),
+    "noise of no band": (lambda: sv.disturbances.noise(1.0, 0.0), sv.errors.SpecificationError, "0 Hz"),
 }  # fmt: skip
 
 
@@ -266,10 +266,10 @@ def test_inertia_of_many_cases_is_that_of_each(name):
     if sound:
         equations.require_inertia(cases)
     else:
-        with refused(sv.SpecificationError):
+        with refused(sv.errors.SpecificationError):
             equations.require_inertia(cases)
     for case in cases.T:
         try:
             equations.require_inertia(case)
-        except sv.SpecificationError:
+        except sv.errors.SpecificationError:
             assert not sound

@@ -113,7 +113,7 @@ def test_a_run_is_no_sweep(run):
     with refused(SpecificationError, "Run", "sv.sweep"):
         plots.sweep(run)
     with refused(SpecificationError, "tradeoff", "sv.sweep"):
-        plots.sweep(servoctl.Study("tradeoff", {}, {}))
+        plots.sweep(servoctl.types.Study("tradeoff", {}, {}))
 
 
 def test_the_load_of_a_crane_is_drawn_on_its_path(gallery_model):
@@ -302,7 +302,7 @@ import servoctl
 from servoctl import figures as plots
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
 t = np.linspace(0, 1, 9)
-plots.save_figures(servoctl.Run(t, np.array([t, t]), ("x", "y")), {str(tmp_path)!r})
+plots.save_figures(servoctl.types.Run(t, np.array([t, t]), ("x", "y")), {str(tmp_path)!r})
 assert "matplotlib.pyplot" not in sys.modules
 """
     path = os.pathsep.join([str(Path(servoctl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])

@@ -78,7 +78,7 @@ def scene_run(name, model):
         try:
             with warned("unstable") if name == "vtol-centre" else contextlib.nullcontext():
                 RUNS[name] = sv.simulate(model, scene_start(name, model), gallery[name].t_span)
-        except sv.SingularProgram as error:
+        except sv.errors.SingularProgram as error:
             RUNS[name] = error.run
     return RUNS[name]
 
@@ -395,7 +395,7 @@ def test_the_report_of_a_crane(crane_plan):
 
 def test_rates_are_exact_where_the_run_has_the_jets(crane_plan):
     model = crane_plan.model
-    run = sv.simulate(model, crane_plan.start, (0.0, 8.0), sv.Algebraic())
+    run = sv.simulate(model, crane_plan.start, (0.0, 8.0), sv.methods.Algebraic())
     sampled = sv.report(run).efforts["trolley"]
     finer = sv.simulate(model, crane_plan.start, (0.0, 8.0), t_eval=np.linspace(0.0, 8.0, 8001))
     assert sampled.rate == pytest.approx(sv.report(finer).efforts["trolley"].rate, rel=1e-4)
@@ -428,18 +428,18 @@ def test_the_figure_of_a_report(name, gallery_model, tmp_path):
 def test_what_is_no_specification_is_refused(gallery_model, crane_plan):
     model = gallery_model("two-cars")
     for given in ((None,), ("two-cars",), (model, 3.0), (model, crane_plan), (model, crane_plan.start)):
-        with refused(sv.SpecificationError):
+        with refused(sv.errors.SpecificationError):
             sv.report(*given)
-    with refused(sv.SpecificationError, "sv.derive(mechanism, program)"):
+    with refused(sv.errors.SpecificationError, "sv.derive(mechanism, program)"):
         sv.report(gallery["two-cars"].build()[0])
 
 
 def test_limits_need_a_run_and_an_actuator(crane_plan):
-    with refused(sv.SpecificationError, "trolley"):
+    with refused(sv.errors.SpecificationError, "trolley"):
         sv.report(crane_plan.model, None, {"trolley": 100.0})
-    with refused(sv.NameUnknown, match="trolley"):
+    with refused(sv.errors.NameUnknown, match="trolley"):
         sv.report(crane_plan, limits={"troley": 100.0})
-    with refused(sv.SpecificationError, name="trolley"):
+    with refused(sv.errors.SpecificationError, name="trolley"):
         sv.report(crane_plan, limits={"trolley": -1.0})
 
 
@@ -498,7 +498,7 @@ def test_a_run_that_stays_on_a_kink_is_inconclusive(name):
     run = sv.simulate(model, model.start(), (0.0, 3.0))
     assert run.internal["verdict"] == "inconclusive" and "stays on a switch" in run.internal["text"]
     mechanism, program = beside(KINKS[name], ca.SX(0))
-    with refused(sv.UnstableInternalDynamics, "switch", verdict="inconclusive"):
+    with refused(sv.errors.UnstableInternalDynamics, "switch", verdict="inconclusive"):
         sv.computed(run, sv.plant(mechanism), rate=100.0)
 
 
@@ -538,7 +538,7 @@ def test_output_redefinition_refuses_an_equilibrium_on_a_kink():
     mechanism = sv.Mechanism(
         q, gibbs=S, actuators={"F": x}, forces=ca.vertcat(0, -p.a * ca.fmax(y, 0) - dy), parameters=p
     )
-    with refused(sv.InconsistentStart, switch="y = 0"):
+    with refused(sv.errors.InconsistentStart, switch="y = 0"):
         sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x}), keep=["y"]), "a", (0.1, 1.0))
 
 

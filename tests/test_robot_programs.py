@@ -168,12 +168,12 @@ def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
 def test_frames_that_cannot_meet_are_refused():
     text = open(robots.file_of("four_bar"), encoding="utf-8").read().replace('xyz="0.5 0 0"', 'xyz="0.5 0.1 0"')
     arm = sv.urdf(text)
-    with refused(sv.SpecificationError, "loop_y", row="loop_y"):
+    with refused(sv.errors.SpecificationError, "loop_y", row="loop_y"):
         sv.loop(arm.frame("coupler_end"), arm.frame("rocker_end"), "position")
     other = sv.urdf(robots.file_of("pendubot"))
-    with refused(sv.SpecificationError, "different robots", frames=["coupler_end", "tip"]):
+    with refused(sv.errors.SpecificationError, "different robots", frames=["coupler_end", "tip"]):
         sv.loop(arm.frame("coupler_end"), other.frame("tip"))
-    with refused(sv.NameUnknown, "psition", match="position"):
+    with refused(sv.errors.NameUnknown, "psition", match="position"):
         sv.loop(arm.frame("coupler_end"), arm.frame("rocker_end"), "psition")
 
 
@@ -184,9 +184,9 @@ def test_held_frames_have_independent_rows():
     assert list(sv.held(arm, ["coupler_end"], straight)) == ["coupler_end_x", "coupler_end_ry"], "x and z are dependent"
     robot = sv.urdf(robots.file_of("quadruped"), base="free")
     assert len(sv.held(robot, ["front_left_foot"], STANDING)) == 6
-    with refused(sv.NameUnknown, "fron_left_foot", match="front_left_foot"):
+    with refused(sv.errors.NameUnknown, "fron_left_foot", match="front_left_foot"):
         sv.held(robot, ["fron_left_foot"], STANDING)
-    with refused(sv.NameUnknown, "bse_z", match="base_z"):
+    with refused(sv.errors.NameUnknown, "bse_z", match="base_z"):
         sv.held(robot, ["front_left_foot"], {"bse_z": 0.3})
 
 
@@ -286,7 +286,7 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
     ],
 )
 def test_programs_refuse_what_they_cannot_mean(call, fact):
-    with refused(sv.SpecificationError, fact):
+    with refused(sv.errors.SpecificationError, fact):
         call(sv.coordinates("x y"))
 
 
@@ -324,11 +324,11 @@ def test_a_spline_passes_through_rotations():
 
 def test_rotations_refuse_half_turns_and_what_is_none():
     half = np.diag([1.0, -1.0, -1.0])
-    with refused(sv.SpecificationError, "half a turn"):
+    with refused(sv.errors.SpecificationError, "half a turn"):
         sv.rotations.slerp(0.5, np.eye(3), half)
-    with refused(sv.SpecificationError, "start"):
+    with refused(sv.errors.SpecificationError, "start"):
         sv.rotations.slerp(0.5, np.diag([1.0, 1.0, -1.0]), np.eye(3))
-    with refused(sv.SpecificationError, "axis", axis=[0, 0, 0]):
+    with refused(sv.errors.SpecificationError, "axis", axis=[0, 0, 0]):
         sv.rotations.turn(0.5, (0, 0, 0))
 
 

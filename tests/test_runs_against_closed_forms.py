@@ -60,7 +60,7 @@ def spiral_start(order):
 
 @pytest.mark.parametrize(
     ("order", "method"),
-    [*((order, sv.Adaptive(rtol=1e-10, atol=1e-12)) for order in ORDERS), (3, "RK4"), (8, "RK4")],
+    [*((order, sv.methods.Adaptive(rtol=1e-10, atol=1e-12)) for order in ORDERS), (3, "RK4"), (8, "RK4")],
 )
 def test_spirals_end_at_one_radian(order, method):
     model, start = spiral_start(order)
@@ -78,7 +78,7 @@ def test_spirals_end_at_one_radian(order, method):
 def test_spirals_by_series_of_which_every_third_coefficient_is_zero(terms):
     order = 4
     model, start = spiral_start(order)
-    run = sv.simulate(model, start, (0.0, 2.0), method=sv.Taylor(order=terms, **TIGHT), t_eval=np.linspace(0, 2, 9))
+    run = sv.simulate(model, start, (0.0, 2.0), method=sv.methods.Taylor(order=terms, **TIGHT), t_eval=np.linspace(0, 2, 9))
     reference = cf.spiral(run.t, order)
     assert max(np.max(np.abs(run[name] - reference[name])) for name in ("x", "y", "dx", "dy")) < 1e-9
 
@@ -133,7 +133,7 @@ def test_cars_force(N, gallery_model):
 
 def test_two_cars_by_an_ideal_reaction_are_another_motion(gallery_model):
     model = gallery_model("two-cars-ideal")
-    run = sv.simulate(model, model.start(x2=0.0, dx2=0.0), (0.0, 12.0), sv.Adaptive(**TIGHT))
+    run = sv.simulate(model, model.start(x2=0.0, dx2=0.0), (0.0, 12.0), sv.methods.Adaptive(**TIGHT))
     t, value = run.extrema("reaction_x1")[1]
     assert value == pytest.approx(6.852059, abs=5e-7) and t == pytest.approx(0.7091, abs=5e-5)
     assert run.extrema("x2")[1][1] - 2.0 == pytest.approx(1.966911, abs=5e-7)
@@ -256,7 +256,7 @@ def test_mass_on_car(alpha, damping, free, index, coordinates):
     model = sliding_mass(alpha, damping, coordinates)
     assert model.free == free and model.structure().index == index
     start = at_rest(model, alpha, coordinates)
-    run = sv.simulate(model, start, (0.0, 6.0), None if model.flat else sv.Adaptive(**TIGHT))
+    run = sv.simulate(model, start, (0.0, 6.0), None if model.flat else sv.methods.Adaptive(**TIGHT))
     reference = cf.mass_on_car(run.t, alpha, damping)
     if coordinates == "absolute":
         along = (run["x_m"] - run["x"]) * np.cos(alpha) + run["y_m"] * np.sin(alpha)
@@ -335,7 +335,7 @@ def test_relative_degree_is_lost_at_an_angle(links, degrees):
 def test_the_unstable_arm_stops_where_the_relative_degree_is_lost(method):
     model = arm("unit")
     options = {"step": 1e-3} if method == "RK4" else {}
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 2.0), method=as_method(method, **options))
     run = caught.value.run
     q2 = np.interp(caught.value.details["t"], run.t[-2:], run["q2"][-2:])
@@ -346,7 +346,7 @@ def test_the_unstable_arm_stops_where_the_relative_degree_is_lost(method):
 @pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK4"])
 def test_the_critical_arm_is_ill_conditioned_where_it_is_straight(method):
     model = arm("unit", 0.4)
-    with pytest.raises(sv.SingularProgram):
+    with pytest.raises(sv.errors.SingularProgram):
         sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 1.0), method=method)
 
 

@@ -9,7 +9,6 @@ from refusals import refused
 from test_continuation import arm, moved
 
 import servoctl as sv
-from servoctl import plots
 from servoctl.run import Run
 
 
@@ -47,11 +46,11 @@ def test_a_run_is_loaded_with_its_model(run, tmp_path):
 
 def test_a_run_is_not_loaded_with_another_model(run, tmp_path, gallery_model):
     path = run.save(tmp_path / "plan.npz")
-    with refused(sv.SpecificationError, residuals=["X", "Y"]):
+    with refused(sv.errors.SpecificationError, residuals=["X", "Y"]):
         sv.load(path, model=arm("circle")[0])
-    with refused(sv.SpecificationError, "parameters"):
+    with refused(sv.errors.SpecificationError, "parameters"):
         sv.load(path, model=gallery_model("overhead-crane"))
-    with refused(sv.SpecificationError, "str", model="str"):
+    with refused(sv.errors.SpecificationError, "str", model="str"):
         sv.load(path, model="spiral")
 
 
@@ -60,7 +59,7 @@ def test_a_run_of_other_parameters_is_refused(gallery_model, tmp_path):
     name, value = next(iter(model.numbers.items()))
     run = sv.simulate(model, model.start(), (0.0, 1.0), t_eval=np.linspace(0, 1, 11))
     path, heavier = run.save(tmp_path / "crane"), model.with_parameters(**{name: 1.5 * value})
-    with refused(sv.SpecificationError, parameters={name: (value, 1.5 * value)}):
+    with refused(sv.errors.SpecificationError, parameters={name: (value, 1.5 * value)}):
         sv.load(path, model=heavier)
     assert sv.load(path, model=heavier.with_parameters(**{name: value})) == run
 
@@ -68,14 +67,14 @@ def test_a_run_of_other_parameters_is_refused(gallery_model, tmp_path):
 def test_the_suffix_of_a_file_may_be_left_out(run, tmp_path):
     run.save(tmp_path / "plan.v2")
     assert sv.load(tmp_path / "plan.v2").message == sv.load(tmp_path / "plan.v2.npz").message == "finished"
-    with refused(sv.ServoError, "plan.v3"):
+    with refused(sv.errors.ServoError, "plan.v3"):
         sv.load(tmp_path / "plan.v3")
 
 
 def test_signals_are_drawn_by_several_names(run):
     units = {"a": "rad", "b": "rad"}
-    (ax,) = plots.signals(run, "a", "b", units=units)
-    assert len(ax.lines) == len(plots.signals(run, ["a", "b"], units=units)[0].lines) == 2
+    (ax,) = sv.figures.signals(run, "a", "b", units=units)
+    assert len(ax.lines) == len(sv.figures.signals(run, ["a", "b"], units=units)[0].lines) == 2
 
 
 # outputs of higher order than the motion ------------------------------------------------------------------------------
@@ -131,7 +130,7 @@ def test_files_and_systems_refuse_outputs_beyond_the_jets(tmp_path):
     q, mechanism = driven_points()
     x, y = q
     model = sv.derive(mechanism(actuators={"a": x, "b": y}), sv.Program({"X": x - ca.sin(q.t), "Y": y}))
-    with refused(sv.SpecificationError, "jerk", name="jerk", order=3, limit=2):
+    with refused(sv.errors.SpecificationError, "jerk", name="jerk", order=3, limit=2):
         sv.export_c(model, tmp_path)
 
 

@@ -46,7 +46,7 @@ def test_a_transport_delay_too_long_for_the_gains_is_refused():
         A, B = np.array([[[0.0, 1.0], [0.0, 0.0]]]), np.array([[[0.0], [0.5]]])
         radius = sampled_radii(A, B, np.array([[[400.0, 40.0]]]), 0.01, np.array([late]))[0]
         assert law.info["largest spectral radius along the plan"] == pytest.approx(radius, rel=1e-9) and radius < 1.0
-    with refused(sv.ServoError, "0.1 s", radius=pytest.approx(1.058, abs=5e-4)):
+    with refused(sv.errors.ServoError, "0.1 s", radius=pytest.approx(1.058, abs=5e-4)):
         sv.pd(point_plan, sv.plant(POINT, delay=0.1), **gains)
 
 

@@ -76,7 +76,7 @@ def test_scenes_against_differences(name, gallery_model):
     """All jets and signals by all parameters and the held initial values; differences of order 4, from other starts."""
     scene, model = gallery[name], gallery_model(name)
     start = model.start(**scene.start, guess=scene.guess)
-    method = None if model.flat else sv.Taylor(rtol=1e-13, atol=1e-14)
+    method = None if model.flat else sv.methods.Taylor(rtol=1e-13, atol=1e-14)
     span, times = (0.0, 1.0), np.linspace(0.0, 1.0, 21)
 
     def run(m, **values):
@@ -257,7 +257,7 @@ def test_bounded_motions_against_differences():
     for model, span, names in ((arm(0.5), (0.0, 2.0), ("c", "d", "Gamma", "m")), (aircraft(), (0.0, 3.0), None)):
         times = np.linspace(*span, 23)[1:-1]
         names = names or list(model.numbers)
-        run = sv.simulate(model, model.start(), span, sv.Bounded(window=14.0, rtol=1e-11))
+        run = sv.simulate(model, model.start(), span, sv.methods.Bounded(window=14.0, rtol=1e-11))
         within = [int(np.argmin(np.abs(run.t - t))) for t in times]
         of = [*model.jet_names, *model.actuators]
         s = sv.sensitivity(run, of, names)
@@ -266,7 +266,7 @@ def test_bounded_motions_against_differences():
             ends = []
             for k in (-2, -1, 1, 2):
                 other = model.with_parameters(**{to: model.numbers[to] + k * h})
-                method = sv.Bounded(window=14.0, rtol=1e-11)
+                method = sv.methods.Bounded(window=14.0, rtol=1e-11)
                 ends.append(sv.simulate(other, other.start(), span, method, t_eval=run.t[within]))
             for signal in of:
                 a, b, c, d = (end[signal] for end in ends)
@@ -279,7 +279,7 @@ def test_a_bounded_motion_has_no_free_initial_values():
     from test_bounded import arm
 
     model = arm(0.5)
-    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded())
     with refused(SpecificationError, name="q2"):
         sv.sensitivity(run, to="q2")
 
@@ -293,9 +293,9 @@ def test_samples_do_not_change_the_derivatives_of_a_bounded_motion(times):
     from test_bounded import arm
 
     model = arm(0.5)
-    full = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=np.linspace(0.0, 2.0, 1001))
-    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded())
-    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.Bounded(), t_eval=times)
+    full = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), t_eval=np.linspace(0.0, 2.0, 1001))
+    whole = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded())
+    run = sv.simulate(model, model.start(), (0.0, 2.0), sv.methods.Bounded(), t_eval=times)
     exact, s = (sv.sensitivity(one, ["q2", "torque"]) for one in (full, run))
     beyond = sv.sensitivity(whole, ["q2", "torque"])
     for pair in s.names:

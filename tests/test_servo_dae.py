@@ -127,9 +127,9 @@ def test_a_comparison_is_a_study_that_prints_saves_and_draws(gallery_model, tmp_
 
 
 def test_what_is_no_dae_in_these_unknowns_is_refused(gallery_model):
-    with refused(sv.SpecificationError, "curvature"):
+    with refused(sv.errors.SpecificationError, "curvature"):
         compared(gallery_model("spiral"), "spiral", [0.1])
-    with refused(sv.NameUnknown, name="index 1"):
+    with refused(sv.errors.NameUnknown, name="index 1"):
         compared(gallery_model("two-cars"), "two-cars", [0.1], forms=["index 1"])
-    with refused(sv.SpecificationError, "[-0.1]"):
+    with refused(sv.errors.SpecificationError, "[-0.1]"):
         compared(gallery_model("two-cars"), "two-cars", [-0.1])

@@ -136,7 +136,7 @@ def test_an_allocation_that_is_impossible_says_so_from_c(plan):
     machine = sv.plant(CRANE, limits={"hoist": (-900.0, 0.0)})
     law = sv.limited(sv.lqr(plan, machine, rate=100.0), machine, bounds={"tension": (1100.0, None)})
     assert law.step.native("step") is not None
-    with refused(sv.LimitExceeded, "tension") as caught:
+    with refused(sv.errors.LimitExceeded, "tension") as caught:
         sv.close(machine, law, plan.state(0.0), (0.0, 4.0))
     assert caught.value.run is not None and len(caught.value.details["low"]) == 2
 

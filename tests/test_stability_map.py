@@ -123,13 +123,13 @@ def test_a_manifold_that_turns_gives_no_false_rates(gallery_model):
 
 def test_poles_that_fit_no_row_and_foreign_runs_are_refused(stiff, gallery_model):
     model, run, found = stiff
-    with refused(sv.NameUnknown, name="nothing"):
-        found.largest_step("RK4", sv.Poles({"nothing": [-1.0, -2.0]}))
-    with refused(sv.SpecificationError, row="z", count=2):
-        found.largest_step("RK4", sv.Poles({"z": [-1.0]}))
-    with refused(sv.NameUnknown, name="LSODA"):
+    with refused(sv.errors.NameUnknown, name="nothing"):
+        found.largest_step("RK4", sv.methods.Poles({"nothing": [-1.0, -2.0]}))
+    with refused(sv.errors.SpecificationError, row="z", count=2):
+        found.largest_step("RK4", sv.methods.Poles({"z": [-1.0]}))
+    with refused(sv.errors.NameUnknown, name="LSODA"):
         found.largest_step("LSODA")
-    with refused(sv.SpecificationError, "x1"):
+    with refused(sv.errors.SpecificationError, "x1"):
         stability(gallery_model("two-cars"), run)
 
 

@@ -132,16 +132,16 @@ def test_conditions_may_contain_higher_derivatives_than_the_state():
 @pytest.mark.parametrize(
     ("kind", "arguments", "details"),
     [
-        (sv.NameUnknown, {"spead": 1.0}, {"match": "speed"}),
-        (sv.NameUnknown, {"d3x": 1.0}, {"match": "d2x"}),
-        (sv.NameUnknown, {"d9y": 1.0}, {"match": "d2y"}),
-        (sv.SpecificationError, {"speed": np.nan}, {"name": "speed"}),
-        (sv.SpecificationError, {"hold": [1.0]}, {"what": "The conditions"}),
-        (sv.SpecificationError, {"hold": {"a": 3.0}}, {"name": "a"}),
-        (sv.SpecificationError, {"hold": {"a": "x"}}, {"type": "str"}),
-        (sv.SpecificationError, {"hold": {"a": ca.SX.sym("z")}}, {"name": "z"}),
-        (sv.InconsistentStart, {"x": 1.0, "east": 0.0}, {"held": "x", "nearest_value": 0.0}),
-        (sv.InconsistentStart, {"x": 0.0, "speed": -1.0}, {"held": "speed", "value": -1.0}),
+        (sv.errors.NameUnknown, {"spead": 1.0}, {"match": "speed"}),
+        (sv.errors.NameUnknown, {"d3x": 1.0}, {"match": "d2x"}),
+        (sv.errors.NameUnknown, {"d9y": 1.0}, {"match": "d2y"}),
+        (sv.errors.SpecificationError, {"speed": np.nan}, {"name": "speed"}),
+        (sv.errors.SpecificationError, {"hold": [1.0]}, {"what": "The conditions"}),
+        (sv.errors.SpecificationError, {"hold": {"a": 3.0}}, {"name": "a"}),
+        (sv.errors.SpecificationError, {"hold": {"a": "x"}}, {"type": "str"}),
+        (sv.errors.SpecificationError, {"hold": {"a": ca.SX.sym("z")}}, {"name": "z"}),
+        (sv.errors.InconsistentStart, {"x": 1.0, "east": 0.0}, {"held": "x", "nearest_value": 0.0}),
+        (sv.errors.InconsistentStart, {"x": 0.0, "speed": -1.0}, {"held": "speed", "value": -1.0}),
     ],
 )
 def test_what_cannot_be_held_is_refused(clothoid, kind, arguments, details):
@@ -152,27 +152,27 @@ def test_what_cannot_be_held_is_refused(clothoid, kind, arguments, details):
 @pytest.mark.parametrize("name", ["speed", "x"])
 def test_a_condition_does_not_take_the_name_of_a_state_or_an_output(clothoid, name):
     x, _ = clothoid.reduction.mechanism.q
-    with refused(sv.SpecificationError, f"{name}=", name=name):
+    with refused(sv.errors.SpecificationError, f"{name}=", name=name):
         clothoid.start(hold={name: x - 1.0})
 
 
 def test_an_output_that_the_dynamics_forbid_is_refused(constant_speed):
     """A free particle of constant speed goes straight on."""
-    with refused(sv.InconsistentStart, "kappa = 0.5", held="kappa") as caught:
+    with refused(sv.errors.InconsistentStart, "kappa = 0.5", held="kappa") as caught:
         constant_speed.start(x=0.0, y=0.0, kappa=0.5)
     assert caught.value.details["nearest_value"] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_coordinates_do_not_take_names_of_a_starts_arguments():
-    with refused(sv.SpecificationError, "hold", name="hold"):
+    with refused(sv.errors.SpecificationError, "hold", name="hold"):
         sv.coordinates("x hold")
 
 
 @pytest.mark.parametrize("names", ["x, y", "x,y", "x,y,", "x ,y"])
 def test_names_with_commas_are_refused_with_the_names_as_they_should_be(names):
-    with refused(sv.SpecificationError, "'x y'", "blanks", names=names):
+    with refused(sv.errors.SpecificationError, "'x y'", "blanks", names=names):
         sv.coordinates(names)
-    with refused(sv.SpecificationError, "'x y'", names=names):
+    with refused(sv.errors.SpecificationError, "'x y'", names=names):
         sv.coordinates("a b").with_quasi_velocities(names, np.eye(2))
 
 
@@ -334,7 +334,7 @@ def test_a_machine_that_rolls_starts_from_rest_at_the_limit_of_its_motion(name):
 @pytest.mark.parametrize("name", ROLLING)
 def test_a_machine_that_stays_at_rest_has_no_limit(name):
     build, open_at_rest = ROLLING[name]
-    with refused(sv.SingularProgram, "stands still", *open_at_rest, t=5.0, nearest_time=None):
+    with refused(sv.errors.SingularProgram, "stands still", *open_at_rest, t=5.0, nearest_time=None):
         build().start(t=5.0)
 
 
@@ -342,7 +342,7 @@ def test_a_machine_that_stays_at_rest_has_no_limit(name):
 def test_a_simulation_from_rest_says_that_the_machine_stands_still(name):
     build, open_at_rest = ROLLING[name]
     model = build()
-    with refused(sv.SingularProgram, "stands still", *open_at_rest, t=0.0) as caught:
+    with refused(sv.errors.SingularProgram, "stands still", *open_at_rest, t=0.0) as caught:
         sv.simulate(model, model.start(), (0.0, 3.0))
     assert "square" not in str(caught.value) and 0 < caught.value.details["nearest_time"] < 0.3
 
@@ -372,7 +372,7 @@ def turning_back(q):
 @pytest.mark.parametrize("along", ["line", "cusp", "velocity", "turning"])
 def test_a_car_that_turns_back_is_told_to_stand_still_there(along):
     model = pushed_car(lambda q: turning_back(q)[along])
-    with refused(sv.SingularProgram, "stands still", "psi", "skid", rows=["skid"], coordinates=("psi",)) as caught:
+    with refused(sv.errors.SingularProgram, "stands still", "psi", "skid", rows=["skid"], coordinates=("psi",)) as caught:
         sv.simulate(model, model.start(guess={"dx": 1.0}), (0.0, 2.0))
     assert caught.value.details["t"] == pytest.approx(1.0, abs=1e-9)
     assert caught.value.details["nearest_time"] == pytest.approx(1.001)
@@ -381,7 +381,7 @@ def test_a_car_that_turns_back_is_told_to_stand_still_there(along):
 
 def test_a_car_at_rest_whose_speed_is_free_is_told_to_start_in_motion():
     model = pushed_car(lambda q: {"across": q.dt(q["y"] - 0.3)})
-    with refused(sv.SingularProgram, "stands still", "psi", "model.start(dx=", rows=["skid"], nearest_time=None) as caught:
+    with refused(sv.errors.SingularProgram, "stands still", "psi", "model.start(dx=", rows=["skid"], nearest_time=None) as caught:
         sv.simulate(model, model.start(), (0.0, 2.0))
     assert caught.value.details["rates"] == ("dx",)
 
@@ -401,7 +401,7 @@ def test_a_car_at_rest_is_told_so_whatever_swings_on_it():
     path = sv.paths.rest_to_rest(q.t, (0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=6)
     model = sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}, by="actuators"))
     for t, remedy in ((0.1, ""), (4.5, "End the motion before")):  # rounding decides how near it the first one comes
-        with refused(sv.SingularProgram, "stands still", remedy, rates=()):
+        with refused(sv.errors.SingularProgram, "stands still", remedy, rates=()):
             sv.simulate(model, model.start(t=t), (t, 6.0))
     start = model.start(phi=0.3, dphi=1.0)
     assert [start[name] for name in ("psi", "phi", "dphi", "dx")] == pytest.approx([np.pi / 6, 0.3, 1.0, 0.0], abs=1e-6)
@@ -415,7 +415,7 @@ def test_a_path_beyond_the_reach_of_an_arm_is_told_to_keep_within():
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, hand), actuators={"shoulder": a, "elbow": b})
     out = sv.paths.rest_to_rest(q.t, 1.0, 2.3, 2.0)
     model = sv.derive(mechanism, sv.Program({"X": hand[0] - out, "Y": hand[1]}), guess={"a": 1.0, "b": -2.0})
-    with refused(sv.SingularProgram, "'X'", "reaches", rows=["X"]) as caught:
+    with refused(sv.errors.SingularProgram, "'X'", "reaches", rows=["X"]) as caught:
         sv.simulate(model, model.start(guess={"a": 1.0, "b": -2.0}), (0.0, 2.0))
     reach = ca.Function("reach", [q.t], [out])(caught.value.details["t"])
     assert float(reach) == pytest.approx(2.0, abs=1e-6)
@@ -424,7 +424,7 @@ def test_a_path_beyond_the_reach_of_an_arm_is_told_to_keep_within():
 def test_an_actuator_that_acts_on_no_residual_is_not_told_to_write_residuals_otherwise():
     """With y held the car points along x, where its push does not act on y."""
     model = pushed_car(lambda q: {"across": q.dt(q["y"] - 0.3)})
-    with refused(sv.SingularProgram, "'push'", "2", rows=["push"]) as caught:
+    with refused(sv.errors.SingularProgram, "'push'", "2", rows=["push"]) as caught:
         sv.simulate(model, model.start(dx=1.0), (0.0, 2.0))
     assert "square" not in str(caught.value)
 
@@ -453,7 +453,7 @@ def test_a_machine_starts_and_moves_as_the_refusal_says(name):
     model = rolled(path, duration)
     start = model.start()
     assert [start["psi"], start["delta"]] == pytest.approx(angles, abs=1e-5) and "once it moves" in repr(start)
-    with refused(sv.SingularProgram, "model.start(t=", "guess=", t=0.0) as caught:
+    with refused(sv.errors.SingularProgram, "model.start(t=", "guess=", t=0.0) as caught:
         sv.simulate(model, start, (0.0, 0.9 * duration))
     t = caught.value.details["nearest_time"]
     moving = model.start(t=t, guess={"psi": start["psi"], "delta": start["delta"]})
@@ -545,7 +545,7 @@ def test_a_hidden_constraint_that_divides_by_zero_is_refused_with_its_divisor(na
     """v tan δ = ψ' says nothing of v on a straight line, and the program of ψ and v leaves no other equation for it."""
     build, t, changes = UNDIVIDED[name]
     model = sv.derive(*build())
-    with refused(sv.SingularProgram, "divides by", "q.dt(heading, 1)", rows=["speed"], residuals=["heading"]) as caught:
+    with refused(sv.errors.SingularProgram, "divides by", "q.dt(heading, 1)", rows=["speed"], residuals=["heading"]) as caught:
         model.start(t)
     later = caught.value.details["nearest_time"]
     assert (later is not None) == changes
@@ -568,7 +568,7 @@ def test_a_constant_curvature_is_programmed_by_its_rate(curvature):
     q = mechanism.q
     _, _, _, first, last = q
     error, speed = ca.tan(first - last) / 0.8 - curvature, {"speed": q.w()[0] - 1.0}
-    with refused(sv.SpecificationError, "q.dt(residual, 1)", rows=["curvature"]):
+    with refused(sv.errors.SpecificationError, "q.dt(residual, 1)", rows=["curvature"]):
         sv.derive(mechanism, sv.Program({"curvature": error} | speed))
     model = sv.derive(mechanism, sv.Program({"curvature": q.dt(error)} | speed))
     run = sv.simulate(model, model.start(theta1=np.arctan(0.8 * curvature), theta2=0.0), (0.0, 3.0))
@@ -595,7 +595,7 @@ def test_a_car_by_rates_of_its_place_starts_from_rest_at_the_limit_of_its_motion
 def test_a_start_where_the_divisor_of_a_hidden_constraint_is_faint_is_refused(t):
     """Just after rest and before it: directions that depend on squares of the speed would be rounding."""
     model = by_rates()
-    with refused(sv.SingularProgram, "divides by", "of its usual size", rows=["X"]) as caught:
+    with refused(sv.errors.SingularProgram, "divides by", "of its usual size", rows=["X"]) as caught:
         model.start(t)
     later = caught.value.details["nearest_time"]
     assert caught.value.details["size"] < 1e-6 and (later is None) == (t > 3)
@@ -606,7 +606,7 @@ def test_a_start_where_the_divisor_of_a_hidden_constraint_is_faint_is_refused(t)
 
 def test_a_car_at_rest_with_given_directions_is_refused_as_it_stands_still():
     """Its hidden constraints are 0/0 at rest."""
-    with refused(sv.SingularProgram, "stands still", "psi", "delta", t=0.0) as caught:
+    with refused(sv.errors.SingularProgram, "stands still", "psi", "delta", t=0.0) as caught:
         by_rates().start(psi=0.0, delta=0.0)
     assert 0 < caught.value.details["nearest_time"] < 1.0
 
@@ -627,7 +627,7 @@ def test_a_search_that_ends_where_an_equation_has_no_gradient_says_so():
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
     model = sv.derive(mechanism, sv.Program({"edge": ca.fmax(x - 1.0, 0.0) - 1.0}, by="ideal"), guess={"x": 3.0})
     assert model.start(guess={"x": 3.0})["x"] == pytest.approx(2.0)
-    with refused(sv.InconsistentStart, "'edge' has no gradient", invariant="edge"):
+    with refused(sv.errors.InconsistentStart, "'edge' has no gradient", invariant="edge"):
         model.start()
 
 
@@ -658,7 +658,7 @@ def test_held_values_that_contradict_each_other_are_all_named(held, parties, nea
     x = model.reduction.mechanism.q["x"]
     if "hold" in held:
         held = {"hold": {name: x - value for name, value in zip("ab", held["hold"], strict=True)}}
-    with refused(sv.InconsistentStart, *parties) as caught:
+    with refused(sv.errors.InconsistentStart, *parties) as caught:
         model.start(**held)
     details = caught.value.details
     assert details["nearest_value"] == pytest.approx(nearest, abs=1e-9)
@@ -670,7 +670,7 @@ def test_the_nearest_value_is_the_one_that_goes_with_the_others():
     q = sv.coordinates("x y")
     mechanism = sv.Mechanism(q, sv.particle(q, 1.0, ca.vertcat(*q)), actuators={"f": q["x"]})
     model = sv.derive(mechanism, sv.Program({"sum": q["x"] + q["y"] - q.t}))
-    with refused(sv.InconsistentStart, "x = 1", "y = 1", nearest_value=-1.0):
+    with refused(sv.errors.InconsistentStart, "x = 1", "y = 1", nearest_value=-1.0):
         model.start(x=1.0, y=1.0)
     assert model.start(x=-1.0, y=1.0)["dx"] == pytest.approx(0.5)
 

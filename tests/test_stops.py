@@ -48,7 +48,7 @@ def on_the_right_branch(squared):
 
 def stopped(model, start, t_span, method, drift=None, **settings):
     """The error by which a simulation ends."""
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, start, t_span, as_method(method, **settings), drift=drift)
     return caught.value
 
@@ -125,7 +125,7 @@ def test_a_fast_wheel_does_not_stop(method, squared):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_start_where_the_wheel_stands_is_refused(method, squared):
-    with refused(sv.SingularProgram, "speed", "dphi"):
+    with refused(sv.errors.SingularProgram, "speed", "dphi"):
         start = squared.start(guess={"dx": 0.0}, dphi=0.0, **ZERO)
         sv.simulate(squared, start, (0.0, 0.5), method=as_method(method, **tolerances(method)))
 
@@ -136,7 +136,7 @@ def test_a_start_where_the_wheel_stands_is_refused(method, squared):
 def test_constant_speed_follows_its_closed_form(gallery_model):
     model, scene = gallery_model("constant-speed"), gallery["constant-speed"]
     start = model.start(**scene.start, guess=scene.guess)
-    run = sv.simulate(model, start, (0.0, 1.0), sv.Adaptive(rtol=1e-12, atol=1e-13))
+    run = sv.simulate(model, start, (0.0, 1.0), sv.methods.Adaptive(rtol=1e-12, atol=1e-13))
     reference = cf.constant_speed(run.t)
     for name in ("x", "y", "dx", "dy"):
         assert np.max(np.abs(run[name] - reference[name])) < 1e-9
@@ -277,7 +277,7 @@ def test_long_steps_change_pivots_on_the_way_back_too(derived, monkeypatch):
     model = derived(on_a_circle, "equation")
     x, y = np.cos(20.0), np.sin(20.0)
     start = model.start(t=20.0, x=x, y=y, dx=-y, dy=x)
-    run = sv.simulate(model, start, (20.0, 0.0), method=sv.Taylor(order=20, rtol=1e-11, atol=1e-13), drift="project")
+    run = sv.simulate(model, start, (20.0, 0.0), method=sv.methods.Taylor(order=20, rtol=1e-11, atol=1e-13), drift="project")
     assert run.success and run.counters["steps"] < 30 and run.counters["pivot_changes"] >= 6
     assert np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max() < 1e-9
 
@@ -329,14 +329,14 @@ def led_round():
 @pytest.mark.parametrize("method", ["DOP853", "RadauIIA", "Taylor", "RK4", "algebraic"])
 def test_where_no_other_pivots_are_found_the_motion_is_kept(method, derived, monkeypatch):
     def none_found(*_):
-        raise sv.InconsistentStart("No state was found.", "Points of a motion are consistent.")
+        raise sv.errors.InconsistentStart("No state was found.", "Points of a motion are consistent.")
 
     model = derived(led_round if method == "algebraic" else driven_pendulum)
     start = model.start(t=0.2, x=np.cos(0.4), y=np.sin(0.4))
     derives_again(monkeypatch)
     monkeypatch.setattr(type(model), "near", none_found)
     settings = {} if method == "algebraic" else precise(method)
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, start, (0.2, 4.0), as_method(method, **settings), t_eval=np.linspace(0.2, 4.0, 381))
     run = caught.value.run
     assert 0.3 < run.t[-1] <= caught.value.details["t"] < 1.7  # within the first half turn
@@ -371,11 +371,11 @@ def test_a_motion_of_all_coordinates_stops_where_an_actuator_has_no_lever(name, 
     lever = model.reduction.mechanism.E[1, 1]
     values = ca.Function("lever", [*model.reduction.mechanism.q], [lever]).map(len(run.t))(run["a"], run["b"])
     assert run["g"] == pytest.approx(1.0 / np.ravel(values), rel=1e-6)
-    with refused(sv.SingularProgram, direction=["d2b"]) as caught:
+    with refused(sv.errors.SingularProgram, direction=["d2b"]) as caught:
         sv.simulate(model, start, (0.0, dead + 0.5), method)
     assert caught.value.details["t"] == pytest.approx(dead, abs=1e-6)
     assert caught.value.details["measure"] < 1e-6 and "actuation" in str(caught.value)
-    with refused(sv.SingularProgram, direction=["d2b"], t=0.0):
+    with refused(sv.errors.SingularProgram, direction=["d2b"], t=0.0):
         sv.simulate(*lifted(name, dead), (0.0, 0.3), method)
 
 
@@ -399,7 +399,7 @@ def pulled_along(path):
 @pytest.mark.parametrize("name", UNDEFINED)
 def test_no_sample_is_without_finite_accelerations(name, method):
     model, start = pulled_along(UNDEFINED[name])
-    with refused(sv.IntegrationStopped, "d2x", "d2th", "t_eval", t=1.0, residual="X") as caught:
+    with refused(sv.errors.IntegrationStopped, "d2x", "d2th", "t_eval", t=1.0, residual="X") as caught:
         sv.simulate(model, start, (0.0, 2.0), method)
     run = caught.value.run
     assert np.isfinite(run.jets).all() and 0.99 < run.t[-1] < 1.0 and not run.success

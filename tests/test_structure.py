@@ -145,7 +145,7 @@ def test_the_essential_order_is_the_class_that_a_path_needs():
         path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=smoothness)
         program = sv.Program({"X": x - height * ca.sin(theta) - path[0], "Z": z + height * ca.cos(theta) - path[1]})
         if smoothness == 3:
-            with refused(sv.SpecificationError, needs=4, has=3):
+            with refused(sv.errors.SpecificationError, needs=4, has=3):
                 sv.derive(mechanism, program)
         else:
             assert sv.derive(mechanism, program).flat
@@ -174,7 +174,7 @@ def test_the_margin_shrinks_where_the_guide_becomes_horizontal():
 
 @pytest.mark.parametrize("damping", [0.0, 1.0])
 def test_a_rank_that_cannot_be_told_is_refused(damping):
-    with refused(sv.SingularProgram, "z", "balance of s"):
+    with refused(sv.errors.SingularProgram, "z", "balance of s"):
         sv.derive(*mass_on_car(1e-6, damping))
 
 
@@ -231,7 +231,7 @@ def test_a_relative_degree_that_is_lost_at_the_start_is_told_with_that_of_the_mo
     assert f"{zero} = 0" in repr(structure) and f" {resting}" in repr(structure) and "lost" in repr(structure)
     start = model.start()
     assert model.structure(start).at == ((0.0, local),)
-    with refused(sv.SingularProgram, f"{zero} = 0", relative_degree=(resting,), in_motion=(moving,)) as caught:
+    with refused(sv.errors.SingularProgram, f"{zero} = 0", relative_degree=(resting,), in_motion=(moving,)) as caught:
         sv.simulate(model, start, (0.0, 4.0))
     assert "square" not in str(caught.value) and caught.value.details["t"] == 0.0
 
@@ -240,7 +240,7 @@ def test_a_relative_degree_that_is_lost_on_the_way_is_told():
     """The pendulum swings down: theta = 0 at t = 0.78 s."""
     model = fixed_rope_crane(target=lambda t: 0.5 * ca.sin(t))
     start = model.start(t=0.7, theta=0.2, dtheta=0.3)
-    with refused(sv.SingularProgram, "theta = 0", relative_degree=(4,), in_motion=(2,), zero=["theta"]) as caught:
+    with refused(sv.errors.SingularProgram, "theta = 0", relative_degree=(4,), in_motion=(2,), zero=["theta"]) as caught:
         sv.simulate(model, start, (0.7, 4.0))
     run = caught.value.run
     assert 0 < run["theta"][-1] < 0.1 and caught.value.details["t"] == pytest.approx(0.7786, abs=1e-3)
@@ -251,7 +251,7 @@ def test_a_relative_degree_that_is_lost_on_the_way_is_told():
 def test_the_place_of_a_lost_relative_degree_need_not_be_zero():
     """The rope upside down."""
     model = fixed_rope_crane()
-    with refused(sv.SingularProgram, "theta = 3.142", relative_degree=(4,), zero=[]):
+    with refused(sv.errors.SingularProgram, "theta = 3.142", relative_degree=(4,), zero=[]):
         sv.simulate(model, model.start(theta=np.pi), (0.0, 1.0))
 
 
@@ -290,12 +290,12 @@ def test_the_structure_of_a_run_and_of_a_start(gallery_model, crane_plan):
     ],
 )
 def test_what_is_no_motion_is_refused(motion, crane_plan):
-    with refused(sv.SpecificationError, "run.jets"):
+    with refused(sv.errors.SpecificationError, "run.jets"):
         crane_plan.model.structure(*motion(crane_plan.model, crane_plan))
 
 
 def test_the_structure_of_a_run_of_another_model_is_refused(gallery_model, crane_plan):
-    with refused(sv.SpecificationError):
+    with refused(sv.errors.SpecificationError):
         gallery_model("two-cars").structure(crane_plan)
 
 

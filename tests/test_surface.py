@@ -22,7 +22,8 @@ from servoctl.gallery import gallery
 
 PACKAGE = Path(sv.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
-ENTRIES = ("__init__.py", "__main__.py")  # of the package itself: they gather the rest
+ENTRIES = ("__init__.py", "__main__.py", "types.py")  # of the package itself: they gather the rest
+FAMILIES = ("errors", "methods", "types")  # modules of public classes
 
 LAYERS = (
     "version", "errors", "values", "markup", "tolerances", "checks", "units", "archive", "progress", "jets", "spec", "robots", "programs", "reduction", "codegen",
@@ -105,13 +106,15 @@ def public():
         if isinstance(thing, ModuleType):
             own = [n for n, f in vars(thing).items() if getattr(f, "__module__", "") == thing.__name__ and n[0] != "_"]
             inside = [(n, getattr(thing, n)) for n in getattr(thing, "__all__", own)]
-            yield from ((f"{name}.{n}", f) for n, f in inside if callable(f))
+            things = [(n if name in FAMILIES else f"{name}.{n}", f) for n, f in inside if callable(f)]
         else:
-            yield name, thing
-        if inspect.isclass(thing):
-            for n, member in vars(thing).items():
-                if not n.startswith("_") and (callable(member) or isinstance(member, property)):
-                    yield f"{name}.{n}", member
+            things = [(name, thing)]
+        yield from things
+        for label, owner in things if not isinstance(thing, ModuleType) or name in FAMILIES else ():
+            if inspect.isclass(owner):
+                for n, member in vars(owner).items():
+                    if not n.startswith("_") and (callable(member) or isinstance(member, property)):
+                        yield f"{label}.{n}", member
 
 
 PUBLIC = dict(public())
@@ -239,7 +242,7 @@ def test_a_large_specification_prints_in_eight_lines():
         assert short(value)
 
 
-@pytest.mark.parametrize("value", [sv.Project(), sv.Poles(0.1), sv.Poles({"X": (-1.0, -2.0)}), gallery["vtol"]])
+@pytest.mark.parametrize("value", [sv.methods.Project(), sv.methods.Poles(0.1), sv.methods.Poles({"X": (-1.0, -2.0)}), gallery["vtol"]])
 def test_small_values_print_in_eight_lines(value):
     assert short(value)
     assert short(str(value))

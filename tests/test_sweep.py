@@ -334,5 +334,5 @@ def test_more_cases_than_fit_into_memory_are_refused():
     assert len(sv.grid(m=range(1000), k=range(1000))) == 10**6
     for make in (lambda: sv.grid(m=range(1001), k=range(1000)), lambda: sv.grid(m=range(10**15)),
                  lambda: sv.monte_carlo(10**6 + 1, seed=1, m=1.0), lambda: sv.monte_carlo(10**30, seed=1, m=1.0)):
-        with refused(sv.SpecificationError, most=10**6):
+        with refused(sv.errors.SpecificationError, most=10**6):
             make()

@@ -183,7 +183,7 @@ def test_a_kink_that_is_only_touched_ends_nothing():
 def test_friction_that_sticks_is_told(method, drift):
     """y'' = 0.5 - 2 sign y' from y' = 1: at rest after 2/3 s, and held there."""
     model, start = beside(lambda t, y, dy: 0.5 - 2 * ca.sign(dy), y=0.0, dy=1.0)
-    with refused(sv.IntegrationStopped, "dy = 0", "0.66666", switches=["dy = 0"]) as caught:
+    with refused(sv.errors.IntegrationStopped, "dy = 0", "0.66666", switches=["dy = 0"]) as caught:
         sv.simulate(model, start, (0.0, 2.0), method, drift=drift)
     run = caught.value.run
     assert 0.66 < run.t[-1] <= 2 / 3 + 1e-6 and run["y"] == pytest.approx(run.t - 0.75 * run.t**2, abs=1e-6)
@@ -191,7 +191,7 @@ def test_friction_that_sticks_is_told(method, drift):
 
 def test_what_slides_along_a_switch_is_told_with_an_accuracy_too():
     model, start = beside(lambda t, y, dy: -ca.sign(y + dy), y=1.0, dy=0.0)
-    with refused(sv.IntegrationStopped, "y+dy = 0", switches=["y+dy = 0"]):
+    with refused(sv.errors.IntegrationStopped, "y+dy = 0", switches=["y+dy = 0"]):
         sv.simulate(model, start, (0.0, 5.0), accuracy=1e-6)
 
 
@@ -202,7 +202,7 @@ def test_switches_of_accelerations_are_refused():
         q, gibbs=(ddx**2 + ddy**2) / 2, actuators={"F": x}, forces={"y": -ca.sign(ddx)}
     )
     model = sv.derive(mechanism, sv.Program({"x": x - ca.sin(q.t)}))
-    with refused(sv.SpecificationError, "d2x", order=2):
+    with refused(sv.errors.SpecificationError, "d2x", order=2):
         sv.simulate(model, model.start(), (0.0, 1.0))
 
 
@@ -230,7 +230,7 @@ def test_a_coupling_that_comes_alive_is_followed(c_compiler):
 @pytest.mark.parametrize(("method", "drift"), PAIRS)
 def test_a_kink_of_a_residual_is_an_impact_and_told(method, drift):
     model, start = ideal(lambda t, x, y, dx, dy: x - ca.fabs(y), y=1.0, dy=-1.0)
-    with refused(sv.IntegrationStopped, "p", "y = 0", residual="p", level="D(p)") as caught:
+    with refused(sv.errors.IntegrationStopped, "p", "y = 0", residual="p", level="D(p)") as caught:
         sv.simulate(model, start, (0.0, 2.0), method, drift=drift)
     assert caught.value.details["t"] == pytest.approx(1.0, abs=1e-6)
     run = caught.value.run
@@ -240,7 +240,7 @@ def test_a_kink_of_a_residual_is_an_impact_and_told(method, drift):
 @pytest.mark.parametrize(("method", "drift"), PAIRS)
 def test_a_residual_that_jumps_stops_the_motion(method, drift):
     model, start = ideal(lambda t, x, y, dx, dy: y - 0.1 * ca.sign(x - 0.5), x=0.0, dx=1.0, y=-0.1)
-    with refused(sv.IntegrationStopped, "x-0.5 = 0", residual="p", level="p") as caught:
+    with refused(sv.errors.IntegrationStopped, "x-0.5 = 0", residual="p", level="p") as caught:
         sv.simulate(model, start, (0.0, 1.0), method, drift=drift)
     assert caught.value.details["t"] == pytest.approx(0.5, abs=1e-6)
     assert caught.value.details["height"] == pytest.approx(0.2)
@@ -259,10 +259,10 @@ ENDS = {  # residual, start, end, what explains it
 def test_a_program_that_ends_stops_the_motion_there(name, method, drift):
     residual, held, end, why = ENDS[name]
     model, start = ideal(residual, **held)
-    with pytest.raises(sv.ServoError) as caught:
+    with pytest.raises(sv.errors.ServoError) as caught:
         sv.simulate(model, start, (0.0, 1.3 * end), method, drift=drift)
-    assert type(caught.value) in (sv.IntegrationStopped, sv.SingularProgram)
-    assert why in str(caught.value) or type(caught.value) is sv.SingularProgram
+    assert type(caught.value) in (sv.errors.IntegrationStopped, sv.errors.SingularProgram)
+    assert why in str(caught.value) or type(caught.value) is sv.errors.SingularProgram
     # a rate jumps where x reaches 1; where dx does, the residual itself leaves slowly, up to 1e-3 of its terms
     late = 5e-3 if name == "asin" else 0.05 if method == "LSODA" else 0.02  # LSODA fails before
     assert caught.value.details["t"] == pytest.approx(end, abs=late)
@@ -275,7 +275,7 @@ def test_other_ends_of_programs(name):
     residual, held, end, why = ENDS[name]
     model, start = ideal(residual, **held)
     for method in ("DOP853", "Taylor"):
-        with refused(sv.IntegrationStopped, why, residual="p") as caught:
+        with refused(sv.errors.IntegrationStopped, why, residual="p") as caught:
             sv.simulate(model, start, (0.0, 1.5 * end), method)
         assert caught.value.details["t"] == pytest.approx(end, abs=1e-3)
 
@@ -284,7 +284,7 @@ def test_other_ends_of_programs(name):
 def test_a_jump_without_a_switch_is_found(method, drift):
     """atan(1/z) jumps by π at z = 0, and its rates do not."""
     model, start = ideal(lambda t, x, y, dx, dy: y - 0.1 * ca.atan(1 / (x - 0.5)), x=0.0, dx=1.0)
-    with refused(sv.IntegrationStopped, "divides by x-0.5", residual="p") as caught:
+    with refused(sv.errors.IntegrationStopped, "divides by x-0.5", residual="p") as caught:
         sv.simulate(model, start, (0.0, 1.0), method, drift=drift)
     assert np.abs(caught.value.run["y"] - 0.1 * np.arctan(1 / (caught.value.run["x"] - 0.5))).max() < 1e-6
 
@@ -293,10 +293,10 @@ def test_coarse_steps_are_no_jump():
     """A circle by steps of which each errs by far more than a tolerance: the user's choice."""
     model, start = ideal(lambda t, x, y, dx, dy: x**2 + y**2 - 1, x=1.0, y=0.0, dy=1.0)
     for step in (0.2, 0.4):
-        run = sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(4, step=step))
+        run = sv.simulate(model, start, (0.0, 6.0), sv.methods.RungeKutta(4, step=step))
         assert run.success and np.abs(run.residual["p"][0]).max() > 1e-6
-        for drift in ("project", sv.Project(5)):
-            assert sv.simulate(model, start, (0.0, 6.0), sv.RungeKutta(4, step=step), drift=drift).success
+        for drift in ("project", sv.methods.Project(5)):
+            assert sv.simulate(model, start, (0.0, 6.0), sv.methods.RungeKutta(4, step=step), drift=drift).success
 
 
 def test_a_first_step_as_long_as_the_span_is_not_believed(gallery_model):
@@ -485,7 +485,7 @@ def test_intervals_between_samples_hide_no_flank(name):
 
 @pytest.mark.parametrize("settings", [{"method": "RadauIIA", "drift": "project"},
                                       {"method": "RadauIIA", "drift": 0.1}, {"accuracy": 1e-8},
-                                      {"method": sv.RadauIIA(5)}, {"method": sv.RadauIIA(13)}], ids=str)  # fmt: skip
+                                      {"method": sv.methods.RadauIIA(5)}, {"method": sv.methods.RadauIIA(13)}], ids=str)  # fmt: skip
 def test_no_setting_steps_over_a_narrow_force(settings):
     for name in ("a bump in time", "a bump in place"):
         force, start, span = NARROW[name]
@@ -604,7 +604,7 @@ FLAT_STOPS = {  # residuals beside x = t; the row, the level that jumps at x = 0
 def test_a_flat_program_stops_where_a_residual_or_its_rate_jumps(name, span):
     residuals, (row, level, height) = FLAT_STOPS[name]
     model, start = flat(residuals)
-    with refused(sv.IntegrationStopped, "jumps", "t = 0.5 s", residual=row, level=level) as caught:
+    with refused(sv.errors.IntegrationStopped, "jumps", "t = 0.5 s", residual=row, level=level) as caught:
         sv.simulate(model, start(span[0]), span)
     details = caught.value.details
     assert details["t"] == pytest.approx(0.5) and details["height"] == pytest.approx(height)

@@ -271,7 +271,7 @@ def test_series_end_where_a_time_law_reaches_the_knots_of_a_table(monkeypatch):
 @pytest.mark.parametrize("law", [lambda t: t, lambda t: sv.paths.rest_to_rest(t, 0.0, 6.0, 6.0, 6)])
 def test_a_table_of_too_low_a_class_is_refused_as_sums_are(monkeypatch, law):
     def refusal():
-        with pytest.raises(sv.SpecificationError) as caught:
+        with pytest.raises(sv.errors.SpecificationError) as caught:
             model = pendulum_cart(lambda t: sv.paths.spline(law(t), EVEN[::4], np.sin(EVEN[::4]), 0, "natural"))
             sv.simulate(model, model.start(theta=0.1, dtheta=0.0), t_span=(0.0, 6.0))
         return caught.value.details
@@ -344,7 +344,7 @@ def test_what_a_derivation_holds_does_not_depend_on_the_number_of_samples():
 def test_steps_end_at_knots_without_a_call_for_each(monkeypatch, c_compiler):
     knots = np.linspace(0.0, 6.0, 600)
     model = pendulum_cart(lambda t: sv.paths.spline(t, knots, np.sin(knots), 3, "natural"))
-    library, ends = series_loop(model, last_index(model, sv.Taylor()))._library, []
+    library, ends = series_loop(model, last_index(model, sv.methods.Taylor()))._library, []
     steps = library.taylor
     monkeypatch.setattr(library, "taylor", lambda *given: ends.append(steps(*given)[1:, 0]) or steps(*given))
     start = model.start(theta=0.1, dtheta=0.0)
@@ -372,5 +372,5 @@ def test_floats_count_the_places_of_a_table(monkeypatch, tmp_path):
     sv.export_c(model, tmp_path, real="float")
     monkeypatch.setattr(export, "COUNTED", most - 1)
     sv.export_c(model, tmp_path)
-    with refused(sv.SpecificationError, numbers=most, most=most - 1):
+    with refused(sv.errors.SpecificationError, numbers=most, most=most - 1):
         sv.export_c(model, tmp_path, real="float")

@@ -74,7 +74,7 @@ def test_the_accuracy_of_steps_follows_the_tolerance(gallery_model):
         start = model.start(**scene.start, guess=scene.guess)
 
         def end(rtol, order=None, model=model, start=start):
-            method = sv.Taylor(order, rtol=rtol, atol=rtol)
+            method = sv.methods.Taylor(order, rtol=rtol, atol=rtol)
             return simulated(model, start, (0.0, 1.0), method, t_eval=[1.0]).jets[: len(start.values), -1]
 
         exact = end(1e-15, 20)
@@ -171,8 +171,8 @@ def appell_hamel():
 def test_rates_that_rows_determine_satisfy_them_to_rounding(scene, rtol=1e-7):
     model, start = scene()
     t = np.linspace(0.0, 2.5, 23)
-    run = simulated(model, start, (0.0, 2.5), sv.Taylor(rtol=rtol, atol=rtol), t_eval=t)
-    exact = simulated(model, start, (0.0, 2.5), sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13), t_eval=t)
+    run = simulated(model, start, (0.0, 2.5), sv.methods.Taylor(rtol=rtol, atol=rtol), t_eval=t)
+    exact = simulated(model, start, (0.0, 2.5), sv.methods.Adaptive("DOP853", rtol=1e-12, atol=1e-13), t_eval=t)
     n_x = len(start.values)
     size = np.abs(exact.jets[:n_x]).max()
     np.testing.assert_allclose(run.jets[:n_x], exact.jets[:n_x], rtol=0.0, atol=10 * rtol * size)
@@ -188,7 +188,7 @@ def test_a_mechanism_as_given_takes_the_steps_of_one_reduced_by_hand():
     steps, ends = [], []
     for by_hand in (False, True):
         model, start = disc(by_hand)
-        run = simulated(model, start, (0.0, 8.0), sv.Taylor(12, rtol=1e-8, atol=1e-8), t_eval=[8.0])
+        run = simulated(model, start, (0.0, 8.0), sv.methods.Taylor(12, rtol=1e-8, atol=1e-8), t_eval=[8.0])
         steps.append(run.counters["steps"])
         ends.append([run[name][-1] for name in ("x", "y", "psi", "phi")])
     assert steps[0] <= steps[1]
@@ -238,7 +238,7 @@ def test_a_motion_without_change_takes_one_step():
     x, y = q
     program = sv.Program({"rest": y}, by="ideal")
     model = sv.derive(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y))), program, keep=["x"])
-    run = simulated(model, model.start(x=0.0, dx=2.0), (0.0, 1e9), sv.Taylor(8, rtol=1e-6), t_eval=[1e9])
+    run = simulated(model, model.start(x=0.0, dx=2.0), (0.0, 1e9), sv.methods.Taylor(8, rtol=1e-6), t_eval=[1e9])
     assert run.counters["steps"] == 1 and run["x"][-1] == 2e9
 
 
@@ -249,7 +249,7 @@ def test_what_rates_do_between_states_is_seen():
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=0.5 * y**2)
     speed = 1.0 + ca.exp(-((20 * (q.t - 3.0)) ** 2))
     model = sv.derive(mechanism, sv.Program({"speed": q.d(1)[0] - speed}, by="ideal"), keep=["y"])
-    method = sv.Taylor(rtol=1e-9, atol=1e-9)
+    method = sv.methods.Taylor(rtol=1e-9, atol=1e-9)
     run = simulated(model, model.start(x=0.0, y=1.0, dy=0.0), (0.0, 6.0), method, t_eval=[6.0])
     assert run["x"][-1] == pytest.approx(6.0 + np.sqrt(np.pi) / 20, abs=1e-7)
 
@@ -371,7 +371,7 @@ def test_a_robot_that_turns_at_measured_rates_has_their_integral(samples, span, 
     model = sv.derive(sv.Mechanism(q, gibbs=S, constraints=wheel), sv.Program(program, by="ideal"))
     start = model.start(t=span[0], x=0.0, y=0.0, theta=0.1)
     t_eval = np.unique(np.concatenate([np.linspace(*sorted(span), 41), times[(times > 0.3) & (times < 5.9)]]))
-    run = sv.simulate(model, start, span, sv.Taylor(rtol=1e-10), t_eval=t_eval[:: 1 if span[0] < span[1] else -1])
+    run = sv.simulate(model, start, span, sv.methods.Taylor(rtol=1e-10), t_eval=t_eval[:: 1 if span[0] < span[1] else -1])
     curve = make_interp_spline(times, rates[:, None], k=5, bc_type=([(3, [0.0]), (4, [0.0])],) * 2)
     angle = curve.antiderivative()
     heading = 0.1 + angle(run.t)[:, 0] - angle(span[0])[0]
@@ -382,6 +382,6 @@ def test_a_robot_that_turns_at_measured_rates_has_their_integral(samples, span, 
     np.testing.assert_allclose(run["d2theta"], curve(run.t, nu=1)[:, 0], atol=1e-10)
     middle = float(heading.min() + heading.max()) / 2
     ends = sv.Event("theta", middle, terminal=True)
-    ended = sv.simulate(model, start, span, sv.Taylor(rtol=1e-10), events=ends)
+    ended = sv.simulate(model, start, span, sv.methods.Taylor(rtol=1e-10), events=ends)
     reached = 0.1 + angle(ended.t[-1])[0] - angle(span[0])[0]
     assert ended["theta"][-1] == pytest.approx(middle, abs=1e-9) and reached == pytest.approx(middle, abs=1e-9)

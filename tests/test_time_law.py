@@ -77,11 +77,11 @@ def test_a_limit_at_zero_is_a_limit():
 def test_motions_that_cease_to_exist_before_a_limit_are_no_fastest_ones(monkeypatch):
     def simulated(model, start, span, **options):
         if span[1] < 1.5:
-            raise sv.IntegrationStopped("No motion is quicker than 1.5 s.")
+            raise sv.errors.IntegrationStopped("No motion is quicker than 1.5 s.")
         return sv.simulate(model, start, span, **options)
 
     monkeypatch.setattr("servoctl.control.time_law.simulated", simulated)
-    with refused(sv.LimitExceeded, factor=pytest.approx(0.75, abs=1e-4)):
+    with refused(sv.errors.LimitExceeded, factor=pytest.approx(0.75, abs=1e-4)):
         sv.fastest(*cars(), {"force": 3000.0}, (0.0, 2.0))
 
 
@@ -95,31 +95,31 @@ def test_weights_of_actuators_are_slowed_as_well():
 
 
 def test_static_loads_beyond_the_limits_are_refused_with_the_numbers():
-    with refused(sv.LimitExceeded, "-981", name="hoist", factor=4096.0):
+    with refused(sv.errors.LimitExceeded, "-981", name="hoist", factor=4096.0):
         sv.fastest(*overhead_crane(), {"hoist": (-900.0, 0.0)}, (0.0, 6.0), guess={"l": 4.0})
 
 
 def test_bad_input():
     mechanism, program = cars()
     for factor in (0.0, -1.0, "fast", np.nan):
-        with refused(sv.SpecificationError, "factor"):
+        with refused(sv.errors.SpecificationError, "factor"):
             program.slowed(mechanism.q, factor)
     for at in ("now", None, np.nan):
-        with refused(sv.SpecificationError, repr(at)):
+        with refused(sv.errors.SpecificationError, repr(at)):
             program.slowed(mechanism.q, 2.0, at=at)
     for limits, span, fact in (
         ({}, (0.0, 2.0), "limits"), (5.0, (0.0, 2.0), "limits"), ({"force": 200.0}, (2.0, 0.0), "(2.0, 0.0)")
     ):  # fmt: skip
-        with refused(sv.SpecificationError, fact):
+        with refused(sv.errors.SpecificationError, fact):
             sv.fastest(mechanism, program, limits, span)
     for pair, kind in (((mechanism, "cars"), "Program"), (("cars", program), "Mechanism")):
-        with refused(sv.SpecificationError, "str", kind.lower()):
+        with refused(sv.errors.SpecificationError, "str", kind.lower()):
             sv.fastest(*pair, {"force": 200.0}, (0.0, 2.0))
     for given in ("start", "parameters"):
-        with refused(sv.SpecificationError, "[1.0]"):
+        with refused(sv.errors.SpecificationError, "[1.0]"):
             sv.fastest(mechanism, program, {"force": 200.0}, (0.0, 2.0), **{given: [1.0]})
     for limit in ((1.0, -1.0), (None, None), "1..2", np.nan):
-        with refused(sv.SpecificationError, name="force"):
+        with refused(sv.errors.SpecificationError, name="force"):
             sv.fastest(mechanism, program, {"force": limit}, (0.0, 2.0))
-    with refused(sv.NameUnknown, name="forse", match="force"):
+    with refused(sv.errors.NameUnknown, name="forse", match="force"):
         sv.fastest(mechanism, program, {"forse": 1.0}, (0.0, 2.0))

@@ -148,34 +148,34 @@ def test_what_is_no_curve_is_refused():
         (sv.Program({"X": x - 1.0}), "X"),
         (sv.Program({"X": q.d(1)[0] - t}), "X"),
     ):
-        with refused(sv.SpecificationError, name=name):
+        with refused(sv.errors.SpecificationError, name=name):
             sv.fastest(pushed[0], program, wanted, (0.0, 2.0), shape=True)
-    with refused(sv.SpecificationError, "0.495", name="X"):
+    with refused(sv.errors.SpecificationError, "0.495", name="X"):
         sv.fastest(*mass(there_and_back), wanted, (0.0, 2.0), shape=True)
     windy = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), forces={"x": ca.sin(t)}, actuators={"push": x})
-    with refused(sv.SpecificationError, name="the mechanism"):
+    with refused(sv.errors.SpecificationError, name="the mechanism"):
         sv.fastest(windy, pushed[1], wanted, (0.0, 2.0), shape=True)
-    with refused(sv.SpecificationError, name="speed"):
+    with refused(sv.errors.SpecificationError, name="speed"):
         sv.fastest(
             *wheeled_robot(), {"steer": 0.5}, (0.0, 5.0), start=gallery["wheeled-robot"].start, guess={"v": 1.0}, shape=True
         )
-    with refused(sv.SpecificationError, "str", name="shape"):
+    with refused(sv.errors.SpecificationError, "str", name="shape"):
         sv.fastest(*pushed, wanted, (0.0, 2.0), shape="yes")
-    with refused(sv.NameUnknown, name="pull"):
+    with refused(sv.errors.NameUnknown, name="pull"):
         sv.fastest(*pushed, {"pull": 3.0}, (0.0, 2.0), shape=True)
 
 
 def test_limits_without_a_time_law_are_refused():
-    with refused(sv.LimitExceeded, "-981", name="hoist"):
+    with refused(sv.errors.LimitExceeded, "-981", name="hoist"):
         sv.fastest(*overhead_crane(), {"hoist": (-900.0, 0.0)}, (0.0, 6.0), guess={"l": 4.0}, shape=True)
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), actuators={"fx": x, "fy": y})
-    with refused(sv.SpecificationError, factor=2.0**-12):
+    with refused(sv.errors.SpecificationError, factor=2.0**-12):
         sv.fastest(mechanism, sv.Program({"X": x - S7(q.t), "Y": y}), {"fy": 3.0}, (0.0, 5.0), shape=True)
 
 
 def test_unstable_internal_dynamics_are_refused():
     aircraft, program = gallery["vtol-centre"].build()
-    with refused(sv.UnstableInternalDynamics, "minimum phase"):
+    with refused(sv.errors.UnstableInternalDynamics, "minimum phase"):
         sv.fastest(aircraft, program, {"u1": (0.0, 500.0), "u2": (0.0, 500.0)}, (0.0, 4.0), shape=True)

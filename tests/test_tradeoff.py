@@ -69,7 +69,7 @@ def test_the_numbers_are_those_of_the_run(drift, method, step, study, scene):
     model, start = scene
     row = study.where(method=method, drift=drift, value=step).rows()[0]
     run = sv.simulate(model, start, SPAN, as_method(method, step=step), drift=drift, t_eval=instants())
-    exact = sv.simulate(model, start, SPAN, sv.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=run.t)
+    exact = sv.simulate(model, start, SPAN, sv.methods.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=run.t)
     assert row["error"] == pytest.approx(motion_error(model, run.jets, exact.jets), rel=1e-3)
     assert row["residual"] == max(np.abs(run.residual[name]).max() for name in run.residual)
     assert row["evaluations"] == run.counters["nfev"] and row["steps"] == run.counters["steps"]
@@ -93,7 +93,7 @@ def test_errors_between_the_steps_count(scene):
         best = study.recommend(error=error)
         run = sv.simulate(*scene, (0.0, 2.0), **best)
         dense = np.random.default_rng(3).uniform(0.0, 2.0, 1500)
-        exact = sv.simulate(*scene, (0.0, 2.0), sv.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=np.sort(dense))
+        exact = sv.simulate(*scene, (0.0, 2.0), sv.methods.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=np.sort(dense))
         jets = np.array([run.at(t) for t in exact.t]).T
         assert motion_error(scene[0], jets, exact.jets) <= 1.5 * error
 
@@ -152,7 +152,7 @@ def test_a_program_without_free_values_is_solved(gallery_model):
     solved = crane.where(method="algebraic")
     assert len(solved) == 1 and solved["error"][0] <= 1e-12 and solved["actuation"][0] <= 1e-11
     assert crane.where(method="RK4", drift="none")["error"][0] > 1e-9
-    assert crane.recommend(error=1e-12) == {"method": sv.Algebraic()}
+    assert crane.recommend(error=1e-12) == {"method": sv.methods.Algebraic()}
 
 
 # --- advice
@@ -176,14 +176,14 @@ def test_a_recommendation_is_kept(study, scene):
     best = study.recommend(error=1e-6)
     assert best.row["error"] <= 1e-6
     run = sv.simulate(*scene, SPAN, **best)
-    exact = sv.simulate(*scene, SPAN, sv.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=run.t)
+    exact = sv.simulate(*scene, SPAN, sv.methods.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=run.t)
     assert motion_error(scene[0], run.jets, exact.jets) <= 2e-6
     assert study.recommend(seconds=1e3).row["error"] == study.pareto()["error"][-1]
 
 
 def test_the_fastest_within_an_error_and_the_best_within_a_time():
     made = synthetic([1e-2, 1e-6, 1e-9, np.nan, 1e-15], [1e-3, 2e-3, 5e-3, np.nan, 1.0])
-    assert made.recommend(error=1e-5) == {"method": sv.Taylor(rtol=0.1, atol=1e-3), "drift": "project"}
+    assert made.recommend(error=1e-5) == {"method": sv.methods.Taylor(rtol=0.1, atol=1e-3), "drift": "project"}
     assert made.recommend(seconds=6e-3)["method"].rtol == 0.01
     assert made.recommend(error=1e-12)["method"].rtol == 1e-4
     with refused(LimitExceeded, "error 1e-12 in 1 s", limit=1e-14, uncertainty=1e-12):
@@ -206,7 +206,7 @@ def test_a_recommended_time_constant_is_the_measured_one(scene):
 @pytest.mark.parametrize("drift", ["none", "project", "project 5", "0.05"])
 def test_a_recommended_treatment_is_the_measured_one(drift):
     options = synthetic([1e-6], [1.0], drift=[drift]).recommend(error=1e-3)
-    wanted = {"none": None, "project 5": sv.Project(5), "0.05": 0.05}.get(drift, drift)
+    wanted = {"none": None, "project 5": sv.methods.Project(5), "0.05": 0.05}.get(drift, drift)
     assert options.get("drift") == wanted
 
 
@@ -278,7 +278,7 @@ def test_the_plot_draws_every_number(cost, study):
         ({"methods": {"RK4": []}}, SpecificationError, "step of RK4=[] was given"),
         ({"seconds": 0.0}, SpecificationError, "seconds = 0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),
-        ({"drift": [sv.Poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
+        ({"drift": [sv.methods.Poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
         ({"t_span": (0.0, 0.0)}, SpecificationError, "two different finite times"),
         ({"t_span": 3.0}, SpecificationError, "two different finite times"),
     ],

@@ -33,7 +33,7 @@ def test_the_readme_is_accepted(tmp_path):
 def test_wrong_types_are_seen(tmp_path):
     script = """import servoctl as sv
 
-def peak(run: sv.Run) -> float:
+def peak(run: sv.types.Run) -> float:
     name: str = run["trolley"]
     return float(run["trolley"].max())
 
@@ -49,13 +49,13 @@ sv.parameters(m="heavy")
 def test_a_loop_has_its_types(tmp_path):
     script = """import servoctl as sv
 
-def looped(mechanism: sv.Mechanism, plan: sv.Run) -> sv.Closed:
+def looped(mechanism: sv.Mechanism, plan: sv.types.Run) -> sv.types.Closed:
     plant = sv.plant(mechanism, limits={"trolley": 100.0})
     law: sv.Law = sv.limited(sv.lqr(plan, plant, Q={"theta": 1e4}, integral=True), plant, priority=["X"])
     sensors, timing = sv.Sensors({"theta": 1e-3}, seed=1), sv.Timing(delay=1)
     return sv.close(plant, law, plan.state(0.0), (0.0, 8.0), sensors=sensors, timing=timing)
 
-def worst(run: sv.Closed) -> float:
+def worst(run: sv.types.Closed) -> float:
     batch = sv.close_many(run, {"m_load": [90.0, 110.0]}, record=["theta"])
     text: str = run.input["trolley"]
     sv.close(run.plant, run.law, run.states, (0.0, 1.0), timing=0.01)

@@ -167,10 +167,10 @@ def test_every_signal_of_a_scene_has_a_unit(name):
 
 
 def test_axes_have_units(plan):
-    assert [ax.get_ylabel() for ax in sv.plots.actuation(plan)] == ["trolley [N]", "hoist [N]"]
-    (ax,) = sv.plots.signals(plan, "d2x", "d2l")
+    assert [ax.get_ylabel() for ax in sv.figures.actuation(plan)] == ["trolley [N]", "hoist [N]"]
+    (ax,) = sv.figures.signals(plan, "d2x", "d2l")
     assert ax.get_ylabel() == "d2x, d2l [m/s$^{2}$]"
-    assert sv.plots.signals(plan, "x", units={"x": "mm"})[0].get_ylabel() == "x [mm]"
+    assert sv.figures.signals(plan, "x", units={"x": "mm"})[0].get_ylabel() == "x [mm]"
 
 
 def test_printed_values_have_units(plan, loop):
@@ -194,14 +194,14 @@ def test_headers_in_c_have_units(plan, loop, tmp_path):
 def table(request):
     if request.param != "study":
         return request.getfixturevalue(request.param)
-    return sv.Study("many", {"x": [1.0, 2.0], "trolley_max": [3.0, np.nan], "error": ["", "=1"]}, {"units": CRANE_UNITS})
+    return sv.types.Study("many", {"x": [1.0, 2.0], "trolley_max": [3.0, np.nan], "error": ["", "=1"]}, {"units": CRANE_UNITS})
 
 
 def test_tables_have_the_same_columns_and_units(table, tmp_path):
     needs("pandas")
     needs("xarray")
     frame, data = table.to_pandas(), table.to_xarray()
-    study = isinstance(table, sv.Study)
+    study = isinstance(table, sv.types.Study)
     names = list(table.columns if study else table.names)
     assert list(frame.columns) == names and frame.index.name == (None if study else "t")
     assert {name: data[name].attrs.get("units", "") for name in names} == {name: table.unit(name) for name in names}
@@ -249,11 +249,11 @@ def test_a_zero_has_no_sign():
 
 
 def test_what_a_notebook_shows_is_escaped():
-    study = sv.Study("many", {"<b>": ["<script>", "&"]}, {})
+    study = sv.types.Study("many", {"<b>": ["<script>", "&"]}, {})
     shown = study._repr_html_()
     assert "<script>" not in shown and "&lt;script&gt;" in shown and "<th>&lt;b&gt;</th>" in shown
-    assert "&lt;script&gt;" in sv.Study("<script>", {"a": [1]})._repr_html_()
-    assert "<table>" not in sv.Study("empty", {})._repr_html_()
+    assert "&lt;script&gt;" in sv.types.Study("<script>", {"a": [1]})._repr_html_()
+    assert "<table>" not in sv.types.Study("empty", {})._repr_html_()
 
 
 # --- robots

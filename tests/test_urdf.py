@@ -221,12 +221,12 @@ def test_limits_of_zero_are_none():
 
 def test_dry_friction_is_smooth_or_refused():
     text = bar(inside='<axis xyz="0 1 0"/><dynamics friction="0.5"/>')
-    with refused(sv.SpecificationError, "hinge", "friction=0.01", joints=["hinge"]):
+    with refused(sv.errors.SpecificationError, "hinge", "friction=0.01", joints=["hinge"]):
         sv.urdf(text).mechanism()
     arm = sv.urdf(text)
     rest, smooth = (robots.function_of(arm, arm.mechanism(friction=f).balance)(0.0, 0.3, 0.0)[0] for f in (0.0, 0.1))
     assert smooth - rest == pytest.approx(0.5 * np.tanh(3.0))
-    with refused(sv.SpecificationError, "-1"):
+    with refused(sv.errors.SpecificationError, "-1"):
         arm.mechanism(friction=-1.0)
 
 
@@ -277,12 +277,12 @@ REFUSED = {
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_is_no_robot_is_refused(case):
     text, fact, details = REFUSED[case]
-    with refused(sv.SpecificationError, fact, **details):
+    with refused(sv.errors.SpecificationError, fact, **details):
         sv.urdf(text)
 
 
 def test_the_nearest_possible_inertia_is_possible():
-    with refused(sv.SpecificationError, "Nearest") as caught:
+    with refused(sv.errors.SpecificationError, "Nearest") as caught:
         sv.urdf(bar(INERTIAL.replace("2.5", "3.5")))
     moments = np.linalg.eigvalsh(np.array(caught.value.details["possible"]))
     assert moments[2] <= moments[0] + moments[1] + 1e-12
@@ -299,7 +299,7 @@ def test_names_that_do_not_exist_are_answered_with_the_nearest():
         (lambda: sv.urdf(bar(more='<joint name="k" type="fixed"><parent link="baar"/><child link="bar"/></joint>')), "baar", "bar"),
         (lambda: arm.q["lit"], "lit", "lift"),
     ):  # fmt: skip
-        with refused(sv.NameUnknown, name, match=match):
+        with refused(sv.errors.NameUnknown, name, match=match):
             call()
 
 
@@ -307,9 +307,9 @@ def test_a_huge_file_is_refused_unread(tmp_path):
     path = tmp_path / "huge.urdf"
     with path.open("wb") as file:
         file.truncate(30_000_000)
-    with refused(sv.SpecificationError, "30000000", size=30_000_000):
+    with refused(sv.errors.SpecificationError, "30000000", size=30_000_000):
         sv.urdf(path)
-    with refused(sv.SpecificationError, "none.urdf"):
+    with refused(sv.errors.SpecificationError, "none.urdf"):
         sv.urdf(tmp_path / "none.urdf")
 
 
@@ -318,7 +318,7 @@ def test_a_mass_matrix_that_is_not_that_of_the_balance_is_refused():
     balance = ca.vertcat(2 * q.d(2)[0] + q.d(2)[1], q.d(2)[0] + 3 * q.d(2)[1])
     right = ca.SX(ca.DM([[2, 1], [1, 3]]))
     assert sv.Mechanism(q, balance=balance, mass=right).mass is not None
-    with refused(sv.SpecificationError, "d2y", components=["d2y", "d2y"]):
+    with refused(sv.errors.SpecificationError, "d2y", components=["d2y", "d2y"]):
         sv.Mechanism(q, balance=balance, mass=ca.SX(ca.DM([[2, 1], [1, 4]])))
 
 
@@ -385,7 +385,7 @@ def test_links_whose_names_are_one_identifier_keep_apart():
 def test_a_quaternion_is_that_of_the_base_and_a_unit_one():
     arm = assembled(link("root"), link("b"), joint("arm_qw", "root", "b"), base="free")
     assert dict(zip(arm.q.names, arm.posture({}), strict=True))["arm_qw"] == 0.0
-    with refused(sv.SpecificationError, "base_qz=0.3", "Nearest", length=pytest.approx(np.hypot(1.0, 0.3))) as caught:
+    with refused(sv.errors.SpecificationError, "base_qz=0.3", "Nearest", length=pytest.approx(np.hypot(1.0, 0.3))) as caught:
         sv.held(arm, ["b"], {"base_qz": 0.3})
     assert caught.value.details["unit"] == pytest.approx(np.array([0, 0, 0.3, 1.0]) / np.hypot(1.0, 0.3))
     assert len(sv.held(arm, ["b"], {"base_qz": 0.6, "base_qw": 0.8})) == 6
@@ -396,9 +396,9 @@ def test_a_joint_and_what_mimics_it_move_mass_together():
     driven = assembled(ROOT, link("a", ""), link("b"), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
     assert robots.function_of(driven, driven.mechanism().mass)(0.0, 0.0, 0.0)[0] == pytest.approx(4 * 2.0)
     assembled(ROOT, link("a"), link("b", ""), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
-    with refused(sv.SpecificationError, "j", joint="j"):
+    with refused(sv.errors.SpecificationError, "j", joint="j"):
         assembled(ROOT, link("a", ""), link("b", ""), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
-    with refused(sv.SpecificationError, "free base", joint=None):
+    with refused(sv.errors.SpecificationError, "free base", joint=None):
         assembled(link("root", ""), base="free")
 
 
@@ -417,10 +417,10 @@ def test_documents_are_read_as_they_come(change):
 
 @pytest.mark.parametrize("kind", ["fixed", "planar", "floating"])
 def test_joints_without_one_position_are_not_locked(kind):
-    with refused(sv.SpecificationError, kind, "hinge", joint="hinge"):
+    with refused(sv.errors.SpecificationError, kind, "hinge", joint="hinge"):
         sv.urdf(bar(kind=kind), lock={"hinge": 0.3})
 
 
 def test_a_file_without_end_is_refused():
-    with refused(sv.SpecificationError, "bytes"):
+    with refused(sv.errors.SpecificationError, "bytes"):
         sv.urdf("/dev/zero")

@@ -192,7 +192,7 @@ def test_arrays_of_values_cannot_be_written(gallery_model):
 def test_parts_of_a_model_say_how_they_pickle(gallery_model):
     model = gallery_model("overhead-crane")
     for part in (model.reduction, model.reduction.program):
-        with refused(sv.SpecificationError, "sv.derive(mechanism, program)", type=type(part).__name__):
+        with refused(sv.errors.SpecificationError, "sv.derive(mechanism, program)", type=type(part).__name__):
             pickle.dumps(part)
     other = pickle.loads(pickle.dumps(model))
     assert other == model and other.reduction.program == model.reduction.program

@@ -23,7 +23,7 @@ def verdict(run):
     """The verdict, or "refused"."""
     try:
         return sv.verify(run).verdict
-    except sv.ServoError:
+    except sv.errors.ServoError:
         return "refused"
 
 
@@ -307,7 +307,7 @@ def test_changed_forces_fail(name, which, plan):
 
 
 def test_changed_rates_of_signals_fail_and_what_the_model_does_not_know_is_a_doubt(wheel):
-    run = sv.simulate(*wheel, (0.0, 0.2), sv.Taylor(jets=3), t_eval=np.linspace(0.0, 0.2, 11))
+    run = sv.simulate(*wheel, (0.0, 0.2), sv.methods.Taylor(jets=3), t_eval=np.linspace(0.0, 0.2, 11))
     rate = run["dreaction_x"]
     assert "dreaction_x" in run.stored and sv.verify(run).passed
     assert sv.verify(edited(run, stored={"dreaction_x": scaled(rate, 3)})).failures == ("signals",)
@@ -419,7 +419,7 @@ def test_states_between_samples_are_those_of_their_side():
 
 def test_changed_jets_of_higher_order_fail():
     model, start, span = chain(by="ideal")
-    run = sv.simulate(model, start, span, sv.Taylor(jets=5))
+    run = sv.simulate(model, start, span, sv.methods.Taylor(jets=5))
     assert sv.verify(run).passed
     for which in (slice(None), 700):
         assert sv.verify(edited(run, jets=scaled(run.jets, (-1, which)))).failures == ("higher jets",)
@@ -438,7 +438,7 @@ def test_changed_signals_of_a_closed_loop_fail(what, plan):
         one = values.copy()
         one[largest] = wrong
         assert sv.verify(replace(run, **{what: one})).failures == ("loop repeated",)
-    with refused(sv.SpecificationError, "sample"):
+    with refused(sv.errors.SpecificationError, "sample"):
         sv.verify(replace(run, **{what: values[..., :-1]}))
 
 
@@ -474,7 +474,7 @@ MALFORMED = {
 
 @pytest.mark.parametrize("what", MALFORMED)
 def test_what_is_no_run_of_the_model_is_refused(what, plan):
-    with refused(sv.SpecificationError):
+    with refused(sv.errors.SpecificationError):
         sv.verify(MALFORMED[what](plan))
 
 

@@ -188,7 +188,7 @@ def test_limits_of_a_robots_file(angle, effort, said):
 def test_limits_that_a_mechanism_declares(limits, said):
     told = remarks(lifted(3.0, limits=limits))
     assert [one.startswith(said) for one in told] == [True] * bool(said)
-    with pytest.raises(sv.NameUnknown, match="'rpoe'.*'rope'"):
+    with pytest.raises(sv.errors.NameUnknown, match="'rpoe'.*'rope'"):
         lifted(3.0, limits={"rpoe": 1.0})
 
 

@@ -52,7 +52,7 @@ print(model, run, sv.verify(run), sep="\\n")
 """
 ENDS = """try:
     sv.simulate(model, start, {how})
-except sv.SingularProgram as error:
+except sv.errors.SingularProgram as error:
     print(model, error, sep="\\n")
     run = error.run
 """

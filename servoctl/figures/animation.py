@@ -210,7 +210,7 @@ def animate(run, fps=25, trail=None):
 
     Examples
     --------
-    >>> sv.plots.animate(run).save("crane.gif")
+    >>> sv.figures.animate(run).save("crane.gif")
     """
     if not 1 <= finite("fps", fps, "number of frames per second") <= 50:
         raise SpecificationError(

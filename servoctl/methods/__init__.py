@@ -1,1 +1,23 @@
-"""Motions of a model: integrators, drift, runs and their proofs."""
+"""Methods of integration and treatments of drift, with their settings, for `simulate`."""
+
+from servoctl.methods.choice import (
+    Adaptive,
+    Algebraic,
+    Bounded,
+    Poles,
+    Project,
+    RadauIIA,
+    RungeKutta,
+    Taylor,
+)
+
+__all__ = [
+    "Adaptive",
+    "Algebraic",
+    "Bounded",
+    "Poles",
+    "Project",
+    "RadauIIA",
+    "RungeKutta",
+    "Taylor",
+]

@@ -204,7 +204,7 @@ def _jets_alone(accuracy, method, drift):
     raise SpecificationError(
         f"accuracy={accuracy!r} was given with {', '.join(f'{name}={value!r}' for name, value in chosen.items())}.",
         "An accuracy determines the method, its settings and the treatment of drift; only jets may be set.",
-        nearest=f"method=sv.Taylor(jets={method.jets})." if getattr(method, "jets", None) else "",
+        nearest=f"method=sv.methods.Taylor(jets={method.jets})." if getattr(method, "jets", None) else "",
         do=f"Leave out the accuracy, or {' and '.join(chosen)}.",
         **chosen,
     )

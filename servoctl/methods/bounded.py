@@ -101,7 +101,7 @@ def _require_within(window, times):
         raise SpecificationError(
             f"t_eval covers {times[0]:g} to {times[-1]:g} s.",
             f"Samples of the bounded motion lie within its window, {low:.9g} to {high:.9g} s.",
-            do="Sample this window, or widen it by sv.Bounded(window=...).",
+            do="Sample this window, or widen it by sv.methods.Bounded(window=...).",
             t_eval=times.tolist(),
             window=window,
         )
@@ -467,7 +467,7 @@ class Problem(FreeEntries):
                 f"The bounded motion from t = {window[0]:.4g} to {window[1]:.4g} s has an unstable mode of "
                 f"{unstable:.4g} 1/s.",
                 f"It needs {count} intervals, and a mesh has at most {MOST_INTERVALS}.",
-                do="Leave this mode out of the mechanism, or take a shorter window, such as sv.Bounded(5).",
+                do="Leave this mode out of the mechanism, or take a shorter window, such as sv.methods.Bounded(5).",
                 intervals=count,
                 most=MOST_INTERVALS,
             )

@@ -108,7 +108,8 @@ def _place(error, path):
 
 
 def _built(path, scene):
-    from servoctl.spec import Mechanism, Program
+    from servoctl.spec.mechanism import Mechanism
+    from servoctl.spec.program import Program
 
     match value := _reported(path, scene):
         case [Mechanism(), Program()]:
@@ -128,7 +129,8 @@ def _built(path, scene):
 
 def _advice(module):
     """What to do in a file without scene()."""
-    from servoctl.spec import Mechanism, Program
+    from servoctl.spec.mechanism import Mechanism
+    from servoctl.spec.program import Program
 
     functions = [n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == _MODULE]
     if functions:

@@ -114,7 +114,7 @@ def _attempt(case, verified=True):
         a.stage = "start"
         a.start = a.model.start(guess=guess)
         a.stage = "simulate"
-        method = None if a.model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
+        method = None if a.model.flat else sv.methods.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
         a.run = sv.simulate(a.model, a.start, (0.0, SPAN), method, t_eval=np.linspace(0.0, SPAN, SAMPLES))
         if verified:
             a.stage = "verify"
@@ -125,7 +125,7 @@ def _attempt(case, verified=True):
 
 
 def _judged(case, a):
-    if isinstance(a.error, sv.ServoError):
+    if isinstance(a.error, sv.errors.ServoError):
         return _refused(Reference(case), case, a.stage, a.error, a.start, a.model)
     if isinstance(a.error, TooMuchWork):
         return Verdict(f"wrong: more than {MOST_CALLS} calls in {a.stage}")
@@ -248,9 +248,9 @@ def _towards(model, start, stop, run):
     """The motion to a stop that came before the first sample, sampled; the run itself where there is none."""
     times = stop * np.linspace(0.0, NEARLY, 21)
     try:
-        method = None if model.flat else sv.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
+        method = None if model.flat else sv.methods.Adaptive("DOP853", rtol=1e-12, atol=1e-13)
         return sv.simulate(model, start, (0.0, times[-1]), method, t_eval=times)
-    except sv.ServoError:
+    except sv.errors.ServoError:
         return run
 
 
@@ -307,7 +307,7 @@ def _cause(reference, case, start, error, model):
         return _beside(reference, start, model)
     if not solved:
         return f"no consistent point: residuals {', '.join(f'{p.residual:.1e}' for p in points)}"
-    if isinstance(error, sv.InconsistentStart):
+    if isinstance(error, sv.errors.InconsistentStart):
         return ""
     if not any(p.clear for p in solved):
         return f"accelerations or actuation undetermined at {len(solved)} points ({solved[0].loose:.1e})"
@@ -327,7 +327,7 @@ def _cause(reference, case, start, error, model):
             return f"dependent directions ({best['directions']:.1e})"
         if m > k and best["decoupling"] < DOUBTFUL:
             return f"redundant, and the decoupling matrix lacks rank ({best['decoupling']:.1e})"
-    if isinstance(error, sv.SpecificationError) and "dependent" in case.kinds:
+    if isinstance(error, sv.errors.SpecificationError) and "dependent" in case.kinds:
         return "a row is a multiple of another"
     if best["mass"] < DOUBTFUL:
         return f"inertia of least singular value {best['mass']:.1e}"

@@ -26,7 +26,7 @@ def varies(values):
 
 def test_a_thousand_seconds_keep_energy_and_the_second_integral(wheel):
     model, start = wheel
-    run = sv.simulate(model, start, (0.0, 1000.0), method=sv.Taylor(rtol=1e-14, atol=1e-16), drift="project")
+    run = sv.simulate(model, start, (0.0, 1000.0), method=sv.methods.Taylor(rtol=1e-14, atol=1e-16), drift="project")
     assert varies(run["energy"]) < 1e-9 and varies(integral(run)) < 1e-9
     assert max(np.abs(run.residual[name]).max() for name in run.residual) < 1e-9
     assert run["dtheta"].min() > 0 and np.ptp(run["dphi"]) > 1.0  # periodic, not at rest
@@ -36,7 +36,7 @@ def test_phi_and_theta_rates_return_after_hundreds_of_periods(wheel):
     """The period, from the first crossings of φ' = 0 upwards, still holds at the end."""
     model, start = wheel
     t = np.append(np.linspace(0.0, 20.0, 4001), np.linspace(980.0, 1000.0, 4001))
-    run = sv.simulate(model, start, (0.0, 1000.0), method=sv.Taylor(rtol=1e-14, atol=1e-16), drift="project", t_eval=t)
+    run = sv.simulate(model, start, (0.0, 1000.0), method=sv.methods.Taylor(rtol=1e-14, atol=1e-16), drift="project", t_eval=t)
     crossings = [
         run.t[i] - run["dphi"][i] * (run.t[i + 1] - run.t[i]) / (run["dphi"][i + 1] - run["dphi"][i])
         for i in np.flatnonzero((run["dphi"][:-1] < 0) & (run["dphi"][1:] >= 0))
@@ -52,7 +52,7 @@ def test_phi_and_theta_rates_return_after_hundreds_of_periods(wheel):
 def test_a_million_fixed_steps(drift, most, wheel):
     model, start = wheel
     t = np.linspace(0.0, 100.0, 101)
-    run = sv.simulate(model, start, (0.0, 100.0), method=sv.RungeKutta(4, step=1e-4), drift=drift, t_eval=t)
+    run = sv.simulate(model, start, (0.0, 100.0), method=sv.methods.RungeKutta(4, step=1e-4), drift=drift, t_eval=t)
     assert run.counters["steps"] == 1_000_000
     levels = {name: np.abs(run.residual[name]).max(axis=1) for name in run.residual}
     assert {name: len(level) for name, level in levels.items()} == {"x_c": 2, "y_c": 2, "string": 3}
@@ -83,7 +83,7 @@ def off(wheel):
 
 @pytest.mark.parametrize("method", ["DOP853", "RK4"])
 def test_a_start_off_the_constraints_is_refused(method, off):
-    with refused(sv.InconsistentStart, invariant="D(string)") as caught:
+    with refused(sv.errors.InconsistentStart, invariant="D(string)") as caught:
         sv.simulate(*off, (0.0, 2.0), method=method)
     assert caught.value.details["residual"] == pytest.approx(1.2e-3, rel=1e-6)  # z' + b φ'
 
@@ -100,13 +100,13 @@ def test_treatments_lead_back_to_the_constraints(method, drift, off):
 
 def test_a_start_of_other_parameters_is_refused(wheel):
     model, start = wheel
-    with refused(sv.InconsistentStart, "model.start", invariant="D(string)"):
+    with refused(sv.errors.InconsistentStart, "model.start", invariant="D(string)"):
         sv.simulate(model.with_parameters(b=0.3), start, (0.0, 1.0))
 
 
 def test_rounding_of_a_long_run_is_no_reason_to_refuse_its_end(wheel):
     model, start = wheel
-    run = sv.simulate(model, start, (0.0, 20.0), method=sv.RungeKutta(4, step=1e-2))
+    run = sv.simulate(model, start, (0.0, 20.0), method=sv.methods.RungeKutta(4, step=1e-2))
     off = max(np.abs(run.residual[name][:, -1]).max() for name in run.residual)
     again = sv.simulate(model, run.jets[: len(model.state_names), -1], (20.0, 21.0))
     assert off > 1e-10 and again.success

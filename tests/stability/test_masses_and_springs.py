@@ -51,7 +51,7 @@ def test_a_flat_program_bears_any_spring(stiffness, tolerance, flat_cars):
 @pytest.mark.parametrize("ratio", [1e4, 1e8])
 def test_an_internal_motion_bears_heavy_masses(name, ratio, slider):
     model = slider.with_parameters(**{name: ratio})
-    run = sv.simulate(model, model.start(s=0.0, ds=0.0), (0.0, 3.0), sv.Adaptive(rtol=1e-11, atol=1e-13))
+    run = sv.simulate(model, model.start(s=0.0, ds=0.0), (0.0, 3.0), sv.methods.Adaptive(rtol=1e-11, atol=1e-13))
     reference = cf.mass_on_car(run.t, np.pi / 4, 1.0, **{name: ratio})
     assert relative(run["s"], reference["s"]) < 1e-8
     assert relative(run["force"], reference["force"]) < 1e-8
@@ -62,7 +62,7 @@ def test_a_sliding_mass_that_hardly_weighs_follows_its_spring(mass, slider):
     """Its fast mode, -d/(m sin²α), has died out: d s' + k s = -m cosα z'' but for terms of the size of the mass."""
     model = slider.with_parameters(m_2=mass)
     start = model.start(s=0.0, ds=0.0)
-    run = sv.simulate(model, start, (0.0, 3.0), method=sv.Adaptive("Radau", rtol=1e-9, atol=1e-11 * mass))
+    run = sv.simulate(model, start, (0.0, 3.0), method=sv.methods.Adaptive("Radau", rtol=1e-9, atol=1e-11 * mass))
     slow, _ = cf.response(run.t, (5.0, 1.0, 0.0), lambda t: -mass * np.sqrt(0.5) * acceleration(t), 3.0)
     assert relative(run["s"], slow) < 20 * mass + 1e-7
     force = acceleration(run.t)  # of the car alone, 1 kg
@@ -100,7 +100,7 @@ def test_a_fast_swing_is_followed(method, stiffness, mass, swinging_cars):
 @pytest.mark.parametrize("method", ["RK4", "RK8"])
 def test_steps_too_long_for_a_stiff_spring_are_told(method, swinging_cars):
     model = swinging_cars.with_parameters(k1=1e9)
-    with refused(sv.IntegrationStopped, method, "0.001 s", "smaller step") as caught:
+    with refused(sv.errors.IntegrationStopped, method, "0.001 s", "smaller step") as caught:
         sv.simulate(model, model.start(**SWING), (0.0, 2.0), method=as_method(method, step=1e-3))  # 22 rad per step
     assert caught.value.run is not None and not caught.value.run.success
 
@@ -112,7 +112,7 @@ def test_steps_too_long_for_a_stiff_spring_are_told(method, swinging_cars):
 @pytest.mark.parametrize("how", ["derived", "changed"])
 def test_a_guide_that_is_nearly_level_is_refused(how, alpha, slider):
     """Relative degree 3 or 2 is not for double precision to say: sin²α is 1e-10 or less."""
-    with refused(sv.SingularProgram, "z", "balance of s") as caught:
+    with refused(sv.errors.SingularProgram, "z", "balance of s") as caught:
         sv.derive(*mass_on_car(alpha, 1.0)) if how == "derived" else slider.with_parameters(alpha=alpha)
     assert "Move the parameters" in str(caught.value)
 
@@ -122,7 +122,7 @@ def test_a_guide_that_is_nearly_level_is_refused(how, alpha, slider):
 def test_a_guide_that_is_level_up_to_rounding_is_level(how, alpha, slider):
     """What sin²α changes of the motion lies below its rounding, too."""
     model = sv.derive(*mass_on_car(alpha, 1.0)) if how == "derived" else slider.with_parameters(alpha=alpha)
-    run = sv.simulate(model, model.start(s=0.0), (0.0, 3.0), method=sv.Adaptive(rtol=1e-11, atol=1e-13))
+    run = sv.simulate(model, model.start(s=0.0), (0.0, 3.0), method=sv.methods.Adaptive(rtol=1e-11, atol=1e-13))
     level = cf.mass_on_car(run.t, 0.0, 1.0)
     assert relative(run["s"], level["s"]) < 1e-9 and relative(run["force"], level["force"]) < 1e-9
 
@@ -132,7 +132,7 @@ def test_a_guide_that_is_hardly_inclined_follows_the_level_one(alpha, slider):
     """The fast mode -d/(m sin²α) has died out; s differs from the level guide's by terms in sin²α."""
     model = slider.with_parameters(alpha=alpha)
     start = model.start(s=0.0, ds=0.0)
-    run = sv.simulate(model, start, (0.0, 3.0), method=sv.Adaptive("Radau", rtol=1e-10, atol=1e-15))
+    run = sv.simulate(model, start, (0.0, 3.0), method=sv.methods.Adaptive("Radau", rtol=1e-10, atol=1e-15))
     level = cf.mass_on_car(run.t, 0.0, 1.0)
     assert relative(run["s"], level["s"]) < 10 * alpha**2
     assert relative(run["force"], level["force"]) < 200 * alpha**2 + 5e-11 / alpha**2  # s weighs k/sin²α
@@ -143,7 +143,7 @@ def test_a_guide_of_any_inclination(alpha, slider):
     model = slider.with_parameters(alpha=alpha)
     assert model.free == 2
     run = sv.simulate(
-        model, model.start(s=0.0, ds=0.0), (0.0, 3.0), method=sv.Adaptive("Radau", rtol=1e-10, atol=1e-13)
+        model, model.start(s=0.0, ds=0.0), (0.0, 3.0), method=sv.methods.Adaptive("Radau", rtol=1e-10, atol=1e-13)
     )
     reference = cf.mass_on_car(run.t, alpha, 1.0)
     assert np.abs(run["s"] - reference["s"]).max() < 1e-9

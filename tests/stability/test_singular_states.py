@@ -42,7 +42,7 @@ def test_a_crane_near_vanishing_pull_is_accurate():
 @pytest.mark.parametrize("duration", [1.3, 1.0, 0.7])
 def test_a_crane_stops_where_its_load_falls_freely(duration):
     model = sv.derive(*overhead_crane(duration))
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, duration))
     run, lost = caught.value.run, free_fall(duration)
     assert 0.95 * lost < run.t[-1] <= caught.value.details["t"] < 1.01 * lost
@@ -55,7 +55,7 @@ def test_a_crane_stops_where_its_load_falls_freely(duration):
 @pytest.mark.parametrize("method", ["Taylor", "RK4", "RadauIIA"])
 def test_an_integrated_crane_stops_there_too(method):
     model = sv.derive(*overhead_crane(1.3))
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, model.start(guess={"l": 4.0}), (0.0, 1.3), method=method)
     run, lost = caught.value.run, free_fall(1.3)
     assert 0.9 * lost < run.t[-1] <= caught.value.details["t"] < 1.01 * lost
@@ -82,7 +82,7 @@ def test_the_wheel_stops_in_every_formulation(method, drift, gallery_model):
     assert run["x"][-1] == pytest.approx(-0.1974199455, abs=1e-6)
     squared = gallery_model("appell-hamel-squared")
     start = squared.start(guess={"dx": 0.5}, **WHEEL)
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(squared, start, (0.0, 1.0), method=as_method(method, **options), drift=drift)
     assert abs(caught.value.details["t"] - WHEEL_STOPS) < 5e-3
     assert "dphi" in caught.value.details["zero"]
@@ -119,7 +119,7 @@ def test_a_curvature_ends_where_the_speed_does(method):
     model, reference = circling(), pendulum(2.0)
     start = model.start(x=0.0, y=0.0, dx=2.0, dy=0.0)
     options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-10, "atol": 1e-12}
-    with pytest.raises((sv.SingularProgram, sv.IntegrationStopped)) as caught:
+    with pytest.raises((sv.errors.SingularProgram, sv.errors.IntegrationStopped)) as caught:
         sv.simulate(model, start, (0.0, 2.0), method=as_method(method, **options))
     lost, run = reference.t_events[0][0], caught.value.run
     assert 0.9 * lost < run.t[-1] < lost + 2e-3 and run.t[-1] <= caught.value.details["t"]
@@ -137,7 +137,7 @@ def test_a_curvature_ends_where_the_speed_does(method):
 def test_the_passive_arm_stops_at_its_lost_relative_degree(method, drift):
     model = sv.derive(*passive_arm(0.5))
     options = {"step": 2e-3} if method == "RK8" else {}
-    with pytest.raises(sv.SingularProgram) as caught:
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 2.0), method=as_method(method, **options), drift=drift)
     run = caught.value.run
     assert 30.0 < np.rad2deg(np.abs(run["q2"][-1])) < 48.1897 + 0.01

@@ -74,7 +74,7 @@ def test_a_pendulum_goes_round_in_any_unit(unit, guess, c_compiler):
     start = model.start(x=0.0, y=-unit, dx=7.0 * unit)
     reference = pendulum(1.0, guess)
     plain = sv.simulate(
-        reference, reference.start(x=0.0, y=-1.0, dx=7.0), (0.0, 2.0), sv.Adaptive(rtol=1e-12, atol=1e-14)
+        reference, reference.start(x=0.0, y=-1.0, dx=7.0), (0.0, 2.0), sv.methods.Adaptive(rtol=1e-12, atol=1e-14)
     )
     for method in ("DOP853", "Taylor", "RadauIIA", "RK4"):
         options = {"step": 1e-3} if method == "RK4" else {"rtol": 1e-12, "atol": 1e-14 * unit}
@@ -127,7 +127,7 @@ def test_motions_of_any_size_have_the_same_relative_error(method, length):
 def test_an_absolute_tolerance_of_the_user_is_kept():
     model = rod(1e-9, {"y": -1e-9})
     start = model.start(x=0.6e-9, dy=0.0, guess={"y": -0.8e-9})
-    loose, default = (sv.simulate(model, start, (0.0, 3.0), sv.Adaptive(atol=atol)) for atol in (1e-11, None))
+    loose, default = (sv.simulate(model, start, (0.0, 3.0), sv.methods.Adaptive(atol=atol)) for atol in (1e-11, None))
     assert loose.counters["steps"] < default.counters["steps"]
 
 
@@ -174,7 +174,7 @@ def test_a_scene_moves_alike_in_any_unit(name):
     def ended(*units):  # some scenes end by design
         try:
             return moved(*units)
-        except sv.SingularProgram as error:
+        except sv.errors.SingularProgram as error:
             return error.run
 
     def scaled(values, length, time):
@@ -183,7 +183,7 @@ def test_a_scene_moves_alike_in_any_unit(name):
     reference = ended(1.0, 1.0, 1.0)
     for length, mass, time in SCALES:
         if (name, length, mass, time) in REFUSED:
-            with pytest.raises(sv.ServoError):
+            with pytest.raises(sv.errors.ServoError):
                 moved(length, mass, time)
             continue
         run = ended(length, mass, time)
@@ -196,7 +196,7 @@ def test_a_scene_moves_alike_in_any_unit(name):
             assert found == pytest.approx(expected, abs=limit), (key, length, mass, time)
 
 
-@pytest.mark.parametrize("method", [None, sv.Taylor(atol=1e-11)], ids=["default", "atol"])
+@pytest.mark.parametrize("method", [None, sv.methods.Taylor(atol=1e-11)], ids=["default", "atol"])
 @pytest.mark.parametrize("offset", [1e3, 1e6])
 def test_a_vehicle_far_from_the_origin_turns_as_at_it(offset, method, gallery_model):
     """Trailers along a curvature: the equations do not know where they are."""
@@ -256,7 +256,7 @@ def test_a_squared_constraint_is_told_from_a_small_one(square, unit):
     program = sv.Program({"circle": circle**2 if square else circle}, by="ideal")
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
     if square:
-        with refused(sv.SingularProgram, row="circle"):
+        with refused(sv.errors.SingularProgram, row="circle"):
             sv.derive(mechanism, program)
     else:
         assert sv.derive(mechanism, program).free == 2
@@ -270,7 +270,7 @@ def test_a_spiral_of_order_16():
     straight = {f"d{k}{axis}": 0.0 for k in range(2, 16) for axis in "xy"}
     start = model.start(x=0.0, y=0.0, dx=1.0, dy=0.0, guess=straight)
     assert model.free == 18
-    run = sv.simulate(model, start, (0.0, 2.0), sv.Adaptive(rtol=1e-7, atol=1e-9), t_eval=np.linspace(0, 2, 9))
+    run = sv.simulate(model, start, (0.0, 2.0), sv.methods.Adaptive(rtol=1e-7, atol=1e-9), t_eval=np.linspace(0, 2, 9))
     reference = cf.spiral(run.t, 16)
     for name in ("x", "y", "dx", "dy"):
         assert np.abs(run[name] - reference[name]).max() < 1e-7
@@ -285,7 +285,7 @@ STEP = 1e-2  # s
 def test_poles_within_the_stability_of_rk4_keep_the_motion(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
-    run = sv.simulate(model, start, (0.0, 2.0), method=sv.RungeKutta(4, step=STEP), drift=sv.Poles(STEP / speed))
+    run = sv.simulate(model, start, (0.0, 2.0), method=sv.methods.RungeKutta(4, step=STEP), drift=sv.methods.Poles(STEP / speed))
     assert np.abs(run["theta"] - cf.appell_hamel(run.t)["theta"]).max() < 1e-6
     assert np.abs(run.residual["string"][0]).max() < 1e-6
 
@@ -295,8 +295,8 @@ def test_poles_within_the_stability_of_rk4_keep_the_motion(speed, gallery_model)
 def test_poles_beyond_it_are_told(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
-    with pytest.raises(sv.ServoError) as caught:
-        sv.simulate(model, start, (0.0, 10.0), method=sv.RungeKutta(4, step=STEP), drift=sv.Poles(STEP / speed))
+    with pytest.raises(sv.errors.ServoError) as caught:
+        sv.simulate(model, start, (0.0, 10.0), method=sv.methods.RungeKutta(4, step=STEP), drift=sv.methods.Poles(STEP / speed))
     assert "poles" in str(caught.value)
 
 
@@ -308,8 +308,8 @@ def test_an_implicit_method_bears_any_poles(speed, gallery_model):
         model,
         start,
         (0.0, 2.0),
-        method=sv.Adaptive("Radau", rtol=1e-8, atol=1e-10),
-        drift=sv.Poles(STEP / speed),
+        method=sv.methods.Adaptive("Radau", rtol=1e-8, atol=1e-10),
+        drift=sv.methods.Poles(STEP / speed),
         t_eval=[1.0, 2.0],
     )
     assert run["theta"] == pytest.approx(cf.appell_hamel(run.t)["theta"], abs=1e-6)
