@@ -1,9 +1,9 @@
 """Bounded motions of programs with unstable internal dynamics, from rest to rest.
 
 `sv.simulate` with `sv.methods.Bounded()` against scipy's solve_bvp: on the functions of the model, called for one
-instant or for all instants at a time, and for the arm with a passive joint on its equations written by hand for NumPy. A peer
-solves for the free entries of the state that we chose for it, with the eigenvectors at rest as its boundary rows and
-our tolerance.
+instant or for all instants at a time, and for the arm with a passive joint on its equations written by hand for
+NumPy. A peer solves for the free entries of the state that we chose for it, with the eigenvectors at rest as its
+boundary rows and our tolerance.
 """
 
 from math import pi

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from conftest import at_random, numbers
 
-from servoctl import spec as sv
+import servoctl as sv
 
 
 def same(a, b, q, parameters=None, rel=1e-12, **overrides):

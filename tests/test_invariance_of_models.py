@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import motion, signal
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.gallery import gallery, mass_on_car, overhead_crane, winch_crane
 from servoctl.model.model import derive

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.model.model import derive
 

@@ -10,7 +10,7 @@ import pytest
 from conftest import motion, signal
 from refusals import refused, warned
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
 from servoctl.methods.choice import Adaptive

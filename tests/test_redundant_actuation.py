@@ -6,8 +6,8 @@ import pytest
 from conftest import motion, numbers, signal
 from refusals import refused
 
+import servoctl as sv
 from servoctl import close, computed, lqr, plant, simulate, verify
-from servoctl import spec as sv
 from servoctl.errors import NameUnknown, NotRealisable, SpecificationError
 from servoctl.gallery import overhead_crane
 from servoctl.model.model import derive

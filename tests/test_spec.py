@@ -7,7 +7,7 @@ from conftest import at_random, numbers
 from frames import UNIT, boat, euler_angles, quaternion, same
 from refusals import refused
 
-from servoctl import spec as sv
+import servoctl as sv
 from servoctl.errors import NameUnknown, SpecificationError
 
 # bodies and balances -------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from servoctl.errors import SpecificationError
 from servoctl.jets.series import Series, _Grouped
 from servoctl.jets.tape import REAL, Tape, evaluate
 from servoctl.methods.taylor import taylor_coefficients
-from servoctl.spec import coordinates
+from servoctl.spec.coordinates import coordinates
 
 RNG = np.random.default_rng(31)
 DEEPEST = 6

@@ -13,7 +13,6 @@ from collections import Counter, defaultdict
 
 import casadi as ca
 
-from servoctl.codegen.scaling import needed
 from servoctl.jets.pieces import Constant, operand_values
 
 CYCLES = defaultdict(
@@ -45,7 +44,17 @@ def short_chains(statements):
     chains = _Chains(statements)
     for statement in statements:
         chains.take(*statement)
-    return needed(chains.statements)
+    return _needed(chains.statements)
+
+
+def _needed(statements):
+    """The statements that outputs need."""
+    read, result = set(), []
+    for target, operation, operands in reversed(statements):
+        if isinstance(target, str) or target in read:
+            read.update(operand_values(operands))
+            result.append((target, operation, operands))
+    return result[::-1]
 
 
 def time_of(statements):

@@ -16,7 +16,6 @@ import casadi as ca
 from servoctl.codegen.chains import short_chains, time_of
 from servoctl.codegen.collecting import collected, ways
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
-from servoctl.codegen.scaling import is_still, scaled
 from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
 from servoctl.jets.branches import apply_code
 from servoctl.jets.lookup import lookup_at, lookups
@@ -82,7 +81,6 @@ class Dialect:
     whole: bool = False  # whether the text holds the numbers of large tables; else loading its library sets them
     chained: bool = False  # whether each evaluation waits for the last: one chunk has the statements of `short_chains`
     collected: bool = False  # whether like terms of these are collected before
-    scaled: bool = False  # whether the statements are those of `scaled`
 
     def constant(self, value):
         """A number as C text, exactly."""
@@ -293,14 +291,19 @@ def series(f, name, dialect=SCALAR, chunk=CHUNK):
 
     ``name_still`` computes what depends on p alone, ``name_moving`` the outputs.
     """
-    statements, tables = _prepared(f, replace(dialect, scaled=True))
+    statements, tables = _prepared(f, dialect)
     still, parts = set(), ([], [])
     for statement in statements:
         target, _, operands = statement
-        alone = isinstance(target, int) and all(is_still(v, still) for v in operands)
+        alone = isinstance(target, int) and all(_is_still(v, still) for v in operands)
         still.update([target] if alone else [])
         parts[not alone].append(statement)
     return "".join(tables) + _in_phases(name, SERIES, parts, dialect, chunk)
+
+
+def _is_still(operand, still):
+    """Whether an operand depends on p alone, as some values do."""
+    return operand in still if isinstance(operand, int) else isinstance(operand, Constant) or operand.startswith("p[")
 
 
 def _in_phases(name, phases, parts, dialect, chunk):
@@ -334,7 +337,6 @@ def _prepared(f, dialect, suffix=""):
     if not dialect.exact:
         chained = dialect.chained and len(statements) <= CHUNK
         some = ways(statements) if chained and dialect.collected else [statements]
-        statements = scaled(statements) if dialect.scaled else statements
         statements = min(map(short_chains, some), key=time_of) if chained else _with_reciprocals(statements)
     return statements, _with_lookups(tables, f, dialect)
 
