@@ -53,7 +53,8 @@ def internal(app, what, name, thing, skip, options):
     if skip or what != "class" or not inspect.isfunction(function):
         return None
     first = function.__qualname__.split(".")[0]
-    owner = next((getattr(home, first) for home in (servoctl, servoctl.types) if hasattr(home, first)), None)
+    homes = (servoctl, servoctl.types, servoctl.methods)
+    owner = next((getattr(home, first) for home in homes if hasattr(home, first)), None)
     known = re.search(rf"\.{name}\b", USED) or f"`{name}`" in (owner.__doc__ or "")
     return None if function.__annotations__ or known else True
 

@@ -96,7 +96,7 @@ def simulate(
         Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
         Σ o_a = 0, else "Taylor", or "RadauIIA" where stability limits its steps; "DOP853" with the treatments of drift
         that series exclude, and for equations so large that making a series takes seconds.
-    drift : None, "project", float, `Project(...)` or `Poles(...)`, optional
+    drift : None, "project", float, `sv.methods.Project(...)` or `sv.methods.Poles(...)`, optional
         Treatment of constraint drift. A number is the time constant of the error dynamics [s].
     accuracy : float, optional
         Largest error of the motion, relative to each component's size. It determines method and drift

@@ -9,6 +9,7 @@ from servoctl.inversion.design import Design
 from servoctl.inversion.output import MinimumPhase
 from servoctl.inversion.report import Report
 from servoctl.model.model import Model
+from servoctl.model.start import State
 from servoctl.plants.plant import Plant
 from servoctl.robots.robot import Frame, Robot
 from servoctl.run import Run
@@ -41,6 +42,7 @@ __all__ = [
     "Run",
     "Sensitivity",
     "StabilityMap",
+    "State",
     "Study",
     "TimeLaw",
     "TradeOff",

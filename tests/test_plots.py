@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from refusals import refused
 
 import servoctl
-from servoctl import figures as plots
+from servoctl import figures
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import gallery
 from servoctl.run import Run
@@ -60,7 +60,7 @@ def verticals(ax):
 
 
 def test_a_path_is_drawn_in_the_plane_that_the_names_span(run):
-    ax = plots.path(run, units=UNITS)
+    ax = figures.path(run, units=UNITS)
     curve = ax.get_lines()[0]
     assert np.array_equal(curve.get_xdata(), run["x"]) and np.array_equal(curve.get_ydata(), run["z"])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [m]", "z [m]")
@@ -82,43 +82,43 @@ def test_a_path_is_drawn_in_the_plane_that_the_names_span(run):
     ],
 )
 def test_default_plane(names, expected):
-    ax = plots.path(a_run(names))
+    ax = figures.path(a_run(names))
     assert (ax.get_xlabel(), ax.get_ylabel()) == expected
 
 
 def test_a_path_by_name_and_with_one_name_only(run):
-    ax = plots.path(run, "theta", "dtheta", units=UNITS)
+    ax = figures.path(run, "theta", "dtheta", units=UNITS)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("theta [rad]", "dtheta [rad/s]")
     assert ax.get_aspect() == "auto"
-    assert plots.path(run, x="z").get_ylabel() == "x"
-    assert plots.path(run, y="x").get_xlabel() == "z"
+    assert figures.path(run, x="z").get_ylabel() == "x"
+    assert figures.path(run, y="x").get_xlabel() == "z"
 
 
 def test_a_single_coordinate_is_drawn_over_time():
-    ax = plots.path(a_run("x"), units={"x": "m"})
+    ax = figures.path(a_run("x"), units={"x": "m"})
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("t [s]", "x [m]")
 
 
 def test_flat_paths_keep_their_scales_apart(run):
     run.stored["far"] = 1e3 * run["x"]
-    assert plots.path(run, "x", "far", units={"x": "m", "far": "m"}).get_aspect() == "auto"
+    assert figures.path(run, "x", "far", units={"x": "m", "far": "m"}).get_aspect() == "auto"
 
 
 def test_an_open_run_is_no_closed_loop(run):
     with refused(SpecificationError, "Run", "sv.close"):
-        plots.closed(run)
+        figures.closed(run)
 
 
 def test_a_run_is_no_sweep(run):
     with refused(SpecificationError, "Run", "sv.sweep"):
-        plots.sweep(run)
+        figures.sweep(run)
     with refused(SpecificationError, "tradeoff", "sv.sweep"):
-        plots.sweep(servoctl.types.Study("tradeoff", {}, {}))
+        figures.sweep(servoctl.types.Study("tradeoff", {}, {}))
 
 
 def test_the_load_of_a_crane_is_drawn_on_its_path(gallery_model):
     model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
-    ax = plots.path(servoctl.simulate(model, model.start(guess=scene.guess), scene.t_span))
+    ax = figures.path(servoctl.simulate(model, model.start(guess=scene.guess), scene.t_span))
     curve = ax.get_lines()[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("X [m]", "Z [m]")
     assert np.allclose(curve.get_ydata(), 4.0 - 0.4 * curve.get_xdata(), rtol=0, atol=1e-12)
@@ -126,14 +126,14 @@ def test_the_load_of_a_crane_is_drawn_on_its_path(gallery_model):
 
 def test_an_unknown_name_is_refused_with_the_nearest(run):
     with refused(NameUnknown, name="thetta", match="theta"):
-        plots.path(run, "x", "thetta")
+        figures.path(run, "x", "thetta")
 
 
 # --- signals
 
 
 def test_coordinates_share_a_panel_by_unit(run):
-    axes = plots.signals(run, units=UNITS)
+    axes = figures.signals(run, units=UNITS)
     assert [ax.get_ylabel() for ax in axes] == ["x, z [m]", "theta [rad]"]
     assert [len(lines(ax)) for ax in axes] == [2, 1]
     assert axes[-1].get_xlabel() == "t [s]"
@@ -141,38 +141,38 @@ def test_coordinates_share_a_panel_by_unit(run):
 
 
 def test_without_units_each_signal_has_a_panel(run):
-    assert [ax.get_ylabel() for ax in plots.signals(run)] == ["x", "z", "theta"]
+    assert [ax.get_ylabel() for ax in figures.signals(run)] == ["x", "z", "theta"]
 
 
 def test_one_axes_takes_all_signals_and_keeps_their_units_apart(run):
     ax = Figure().subplots()
-    assert plots.signals(run, ["x", "theta", "d2theta"], ax=ax, units=UNITS) is ax
+    assert figures.signals(run, ["x", "theta", "d2theta"], ax=ax, units=UNITS) is ax
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels == ["x [m]", "theta [rad]", "d2theta [rad/s$^{2}$]"]
 
 
 def test_axes_must_be_as_many_as_panels(run):
     with refused(SpecificationError, "3 Axes", "2 panels"):
-        plots.signals(run, ax=Figure().subplots(3), units=UNITS)
+        figures.signals(run, ax=Figure().subplots(3), units=UNITS)
     two = Figure().subplots(2)
-    assert list(plots.signals(run, ax=two, units=UNITS)) == list(two)
+    assert list(figures.signals(run, ax=two, units=UNITS)) == list(two)
 
 
 def test_colours_are_for_every_colour_vision(run):
-    drawn = lines(plots.signals(run, units=UNITS)[0])
+    drawn = lines(figures.signals(run, units=UNITS)[0])
     assert [to_hex(line.get_color()).upper() for line in drawn] == ["#0072B2", "#D55E00"]
 
 
 def test_many_signals_are_told_apart():
     run = a_run(" ".join(f"s{i}" for i in range(15)))
-    drawn = lines(plots.signals(run, units={f"s{i}": "m" for i in range(15)})[0])
+    drawn = lines(figures.signals(run, units={f"s{i}": "m" for i in range(15)})[0])
     assert len({(line.get_color(), line.get_linestyle()) for line in drawn}) == 15
 
 
 def test_rounding_does_not_fill_a_panel(run):
     run.stored["winch"] = 1e-14 * np.sin(9 * T)
     run.stored["hoist"] = 981.0 + 1e-12 * np.sin(9 * T)
-    axes = plots.actuation(run, names=["trolley", "winch", "hoist"], units=UNITS | {"winch": "N", "hoist": "N"})
+    axes = figures.actuation(run, names=["trolley", "winch", "hoist"], units=UNITS | {"winch": "N", "hoist": "N"})
     assert all(np.ptp(ax.get_ylim()) > 100.0 for ax in axes[1:])
 
 
@@ -180,7 +180,7 @@ def test_rounding_that_is_alone_of_its_unit_does_not_fill_a_panel(run):
     run.stored["drive"], run.stored["steer"] = 1e-15 * np.sin(9 * T), np.sin(T)
     run.stored["small"] = 1e-9 * np.sin(9 * T)
     units = {"drive": "N", "steer": "N m", "small": "m"}
-    axes = plots.actuation(run, names=["drive", "steer", "small"], units=units)
+    axes = figures.actuation(run, names=["drive", "steer", "small"], units=units)
     assert np.ptp(axes[0].get_ylim()) == pytest.approx(0.2 * np.sin(T).max(), rel=0.1)
     assert np.ptp(axes[2].get_ylim()) < 1e-8
 
@@ -188,32 +188,32 @@ def test_rounding_that_is_alone_of_its_unit_does_not_fill_a_panel(run):
 def test_coordinates_moved_by_quasi_velocities_are_recognised():
     jets = np.array([T, T**2, T, 1 + 0 * T])
     run = Run(T, jets, ("x", "psi", "u", "du"), stored={"dx": T, "dpsi": T, "d2x": T, "d2psi": T, "thrust": T})
-    assert [ax.get_ylabel() for ax in plots.signals(run)] == ["x", "psi"]
-    assert plots.efforts(run) == ["thrust"]
+    assert [ax.get_ylabel() for ax in figures.signals(run)] == ["x", "psi"]
+    assert figures.efforts(run) == ["thrust"]
 
 
 # --- actuation
 
 
 def test_each_actuator_has_a_panel_with_its_extrema(run):
-    axes = plots.actuation(run, units=UNITS)
+    axes = figures.actuation(run, units=UNITS)
     assert [ax.get_ylabel() for ax in axes] == ["trolley [N]", "winch [N m]"]
     assert axes[1].get_title(loc="left") == "winch: -8.32294 N m (t = 2 s) to 20 N m (t = 0 s)"
 
 
 def test_an_ideal_program_shows_its_reaction():
     run = a_run("x theta", stored=("reaction_x", "reaction_theta", "multiplier_X", "tension"))
-    axes = plots.actuation(run, units=UNITS)
+    axes = figures.actuation(run, units=UNITS)
     assert [ax.get_ylabel() for ax in axes] == ["reaction_x [N]", "reaction_theta [N m]"]
 
 
 def test_a_run_without_actuation_says_so():
     with refused(SpecificationError, "actuation"):
-        plots.actuation(a_run())
+        figures.actuation(a_run())
 
 
 def test_what_grows_without_bound_before_a_stop_leaves_the_frame(stopped):
-    ax = plots.actuation(stopped)[0]
+    ax = figures.actuation(stopped)[0]
     assert ax.get_ylim()[1] < 200.0 < stopped["force"].max()
     assert ax.get_title(loc="right") == "stopped after t = 2 s"
     assert verticals(ax) == [2.0]
@@ -222,7 +222,7 @@ def test_what_grows_without_bound_before_a_stop_leaves_the_frame(stopped):
 def test_a_signal_that_is_not_finite_is_drawn_where_it_is(run):
     run.stored["trolley"][-1] = np.nan
     run.stored["winch"][:] = np.nan
-    axes = plots.actuation(run)
+    axes = figures.actuation(run)
     assert axes[0].get_title(loc="left") == "trolley: not finite at some instants"
     assert len(axes) == 2
 
@@ -231,10 +231,10 @@ def test_a_signal_that_is_not_finite_is_drawn_where_it_is(run):
 
 
 def test_residuals_tell_constraints_by_colour_and_levels_by_style(run):
-    ax = plots.residuals(run)
+    ax = figures.residuals(run)
     drawn = lines(ax)
     assert [(line.get_color(), line.get_linestyle()) for line in drawn] == [
-        (colour, style) for colour in plots.COLOURS[:2] for style in ("-", "--", ":")
+        (colour, style) for colour in figures.COLOURS[:2] for style in ("-", "--", ":")
     ]
     assert ax.get_yscale() == "log"
     assert drawn[3].get_ydata().min() == 1e-18
@@ -246,13 +246,13 @@ def test_residuals_tell_constraints_by_colour_and_levels_by_style(run):
 
 def test_residuals_of_one_level_and_of_high_levels():
     for levels, expected in ((1, ["c"]), (6, ["3rd derivative", "4th derivative", "5th derivative"])):
-        ax = plots.residuals(a_run(residual={"c": np.full((levels, len(T)), 1e-9)}))
+        ax = figures.residuals(a_run(residual={"c": np.full((levels, len(T)), 1e-9)}))
         assert [text.get_text() for text in ax.get_legend().get_texts()][-3:] == expected
 
 
 def test_a_given_axes_is_used(run):
     ax = Figure().subplots()
-    assert plots.residuals(run, ax=ax) is ax and plots.path(run, ax=ax) is ax and plots.actuation(run, ax=ax) is ax
+    assert figures.residuals(run, ax=ax) is ax and figures.path(run, ax=ax) is ax and figures.actuation(run, ax=ax) is ax
 
 
 # --- early ends
@@ -261,8 +261,8 @@ def test_a_given_axes_is_used(run):
 @pytest.mark.parametrize(("status", "word"), [(1, "interrupted"), (-1, "stopped")])
 def test_early_ends_are_marked(status, word):
     run = a_run("x y", success=False, status=status, residual={"X": np.array([1e-9 * T])})
-    assert plots.path(run).get_legend().get_texts()[1].get_text() == f"{word}, t = 2 s"
-    for ax in (plots.signals(run)[0], plots.residuals(run)):
+    assert figures.path(run).get_legend().get_texts()[1].get_text() == f"{word}, t = 2 s"
+    for ax in (figures.signals(run)[0], figures.residuals(run)):
         assert ax.get_title(loc="right") == f"{word} after t = 2 s"
         assert verticals(ax) == [2.0]
 
@@ -271,7 +271,7 @@ def test_early_ends_are_marked(status, word):
 
 
 def test_figures_are_1000_px_wide(run, tmp_path):
-    files = plots.save_figures(run, tmp_path / "made", units=UNITS, title="a run")
+    files = figures.save_figures(run, tmp_path / "made", units=UNITS, title="a run")
     assert [f.name for f in files] == ["path.png", "coordinates.png", "actuation.png", "residuals.png"]
     for file in files:
         head = file.read_bytes()[:24]
@@ -279,19 +279,19 @@ def test_figures_are_1000_px_wide(run, tmp_path):
 
 
 def test_figures_without_actuation_and_residuals(tmp_path):
-    assert [f.name for f in plots.save_figures(a_run(), tmp_path)] == ["path.png", "coordinates.png"]
+    assert [f.name for f in figures.save_figures(a_run(), tmp_path)] == ["path.png", "coordinates.png"]
 
 
 def test_a_run_of_one_sample_is_drawn(tmp_path):
     signals, rows = {"f": np.ones(1)}, {"X": np.zeros((2, 1))}
     run = Run(np.zeros(1), np.ones((2, 1)), ("x", "dx"), success=False, status=-1, stored=signals, stored_residual=rows)
-    assert len(plots.save_figures(run, tmp_path)) == 3  # x alone is no path
+    assert len(figures.save_figures(run, tmp_path)) == 3  # x alone is no path
 
 
 def test_a_folder_that_cannot_be_written(run, tmp_path):
     (tmp_path / "file").write_text("", encoding="utf-8")
     with refused(ServoError, path=str(tmp_path / "file")):
-        plots.save_figures(run, tmp_path / "file")
+        figures.save_figures(run, tmp_path / "file")
 
 
 def test_pyplot_and_the_backend_are_left_alone(tmp_path):
@@ -299,10 +299,10 @@ def test_pyplot_and_the_backend_are_left_alone(tmp_path):
 import sys
 import numpy as np
 import servoctl
-from servoctl import figures as plots
+from servoctl import figures
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
 t = np.linspace(0, 1, 9)
-plots.save_figures(servoctl.types.Run(t, np.array([t, t]), ("x", "y")), {str(tmp_path)!r})
+figures.save_figures(servoctl.types.Run(t, np.array([t, t]), ("x", "y")), {str(tmp_path)!r})
 assert "matplotlib.pyplot" not in sys.modules
 """
     path = os.pathsep.join([str(Path(servoctl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])

@@ -176,6 +176,24 @@ def test_names_with_commas_are_refused_with_the_names_as_they_should_be(names):
         sv.coordinates("a b").with_quasi_velocities(names, np.eye(2))
 
 
+@pytest.mark.parametrize("begins, rests", [
+    (lambda q, x: x - q.t**3, True),
+    (lambda q, x: x - (10 * q.t**3 - 15 * q.t**4 + 6 * q.t**5), True),
+    (lambda q, x: q.dt(x, 2) - 6 * q.t, False),
+    (lambda q, x: x - q.t**2, False),
+])  # fmt: skip
+def test_a_program_rests_where_its_residual_does_to_first_order(begins, rests):
+    """The load of a crane hangs down where its trolley begins with a jump of the jerk, and where it does not it swings."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    load = ca.vertcat(x + ca.sin(theta), -ca.cos(theta))
+    crane = sv.Mechanism(
+        q, gibbs=sv.particle(q, 10.0, x) + sv.particle(q, 100.0, load), potential=981.0 * load[1], actuators={"trolley": x}
+    )
+    start = sv.derive(crane, sv.Program({"path": begins(q, x)})).start(guess={"theta": 0.3})
+    assert start["theta"] == pytest.approx(0.0 if rests else 0.3, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("name", "valid", "nearest"),
     [

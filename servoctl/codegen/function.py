@@ -40,7 +40,9 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     "pivots" (default: 0); for "taylor" the numbers "nq" of coordinates and "n" of quasi-velocities, the order s̄ "top",
     the highest index of coefficients "last", "plain" (1 if q' = γ', else 0), for `whole` "rates" and
     "invariants", the numbers of values of these functions in `others`, and, beside "settled" there, (t, x, p) ->
-    (x, γ^(s̄)), "free": 0 for each entry of γ', ..., γ^(s̄-1) that it gives, 1 for those integrated.
+    (x, γ^(s̄)), "free": 0 for each entry of γ', ..., γ^(s̄-1) that it gives, 1 for those integrated. Raises
+    SpecificationError for a name that is no C identifier, an operation that is not elementary, or too few outputs for a
+    loop, and NameUnknown for an unknown loop.
     """
     _require_columns(f, name)
     for part in filter(None, (f, project, *(others or {}).values())):

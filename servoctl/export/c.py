@@ -339,9 +339,8 @@ def _schedule(rows, thinned):
 def thin(rows, bound):
     """Rows between which cubic polynomials give all others.
 
-    From rows (N, width): the indices (K,) of those between which they lie, with the first and the last, and the slopes
-    (N, width) of all, changes from row to row. `bound` is the largest error of an entry, relative to its largest
-    magnitude over all rows.
+    Returns the indices (K,) of these rows, with the first and the last, and the slopes (N, width) of all, changes from
+    row to row. `bound` is the largest error of an entry, relative to its largest magnitude over all rows (N, width).
     """
     slopes, allowed = np.gradient(rows, axis=0), bound * np.abs(rows).max(axis=0)
     knots = [0]

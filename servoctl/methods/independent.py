@@ -7,6 +7,7 @@ import casadi as ca
 
 from servoctl.codegen import emit
 from servoctl.errors import SingularProgram
+from servoctl.jets.factors import constants_outside
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import Tape
 from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
@@ -91,9 +92,9 @@ def _products(q, rows):
     """The number of products of series in rows, where one with itself counts half, and that of all operations."""
     tape = Tape(None, ca.cse(ca.vertcat(*(row.expression for row in rows))).elements())
     still = {i for i, symbol in enumerate(tape.symbols) if q.where(symbol) is None}
-    total, moving = 0.0, []
-    for kind, args, data in tape.nodes:
+    nodes, total, moving = constants_outside(tape, still).nodes, 0.0, []
+    for kind, args, data in nodes:
         moving.append(data not in still if kind == "input" else any(moving[a] for a in args))
         series = [a for a in args if moving[a]]
         total += CONVOLUTIONS.get(kind, 0.0) if len(series) == len(args) or kind == "div" and moving[args[1]] else 0.0
-    return total, len(tape.nodes)
+    return total, len(nodes)

@@ -260,7 +260,7 @@ def _rests(model, equations, aim, held, conditions):
 
 
 def _stays(model, t, x):
-    """Whether a state and the residuals stay from t on or, as where a path begins with a jump, did before.
+    """Whether a state stays, and residuals to first order, from t on or, as where a path begins with a jump, before.
 
     Where it is singular, and has no rates, the program holds there if nothing moves.
     """
@@ -269,10 +269,13 @@ def _stays(model, t, x):
     rates, n_x, p = model.function("ode").expression, len(model.state_names), model.parameters
     slow = STILL * (1.0 + np.abs(x[:n_x]))
 
+    given = [k for k, (_, level) in enumerate(model.signals("residuals")[0]) if level == 0]  # not their derivatives
+
     def largest(at, rate):
         residuals = model.signals("residuals", rate)[1].expression
         still = np.append(x[:n_x], np.zeros(residuals.numel_in(1) - n_x))
-        return np.abs(residuals(at, still, p).full()).max(initial=0.0)
+        values = np.abs(residuals(at, still, p).full()).ravel()
+        return values[given if rate else slice(None)].max(initial=0.0)
 
     def stays(at):
         moving = np.abs(rates(at, x[:n_x], p).full()[:n_x, 0])

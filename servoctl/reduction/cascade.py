@@ -131,9 +131,9 @@ class Cascade:
         """The motion by jets up to a given level, and Newton steps to its coordinates where it is `correct`ed first.
 
         Jets up to the level `given` are symbols, 0 for coordinates alone; further ones are computed up to `level`.
-        Pivots are chosen at points with the jets of `solved`. With Newton steps rows have order 0. `running` makes a
-        `Running`, by default that class, of (motion, order, expressions). `errors` by place of a row is what is added
-        to ψ^(given + 1 - order), as by error dynamics.
+        Pivots are chosen at `points`, which have the jets of `solved`. With Newton steps rows have order 0. `running`
+        makes a `Running`, by default that class, of (motion, order, expressions). `errors` by place of a row is what is
+        added to ψ^(given + 1 - order), as by error dynamics.
         """
         motion = Expressions(self, points, given, correct)
         motion.running, motion.errors = running or Running, errors or {}

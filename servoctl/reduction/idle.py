@@ -14,8 +14,8 @@ def needed(mechanism, program, keep=(), named=()):
 
     A coordinate plays a part if residuals, actuators, weights, wishes or outputs contain it, if it is named, or if
     terms of the mechanism couple it to one that does. Coordinates without inertia, or with constraints that depend on
-    each other, are left to the derivation, which refuses them. `keep` names coordinates (NameUnknown if not); `named`
-    are signals, such as derivatives of coordinates, that a caller guesses, holds or bounds.
+    each other, are left to the derivation, which refuses them. `keep` are names of coordinates, NameUnknown is raised
+    for others; `named` are signals, such as derivatives of coordinates, that a caller guesses, holds or bounds.
     """
     q, keep = mechanism.q, texts(keep, "The coordinates to keep")
     for name in keep:

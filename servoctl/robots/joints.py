@@ -118,7 +118,7 @@ def _with_twists(q, tree, places):
 def identifier(name, taken=(), names_of=lambda name: (name,)):
     """A name as a Python identifier that neither a coordinate nor a derivative of one has.
 
-    Names in `taken` and of their derivatives are avoided, also by the names that come with it, which `names_of` gives.
+    Neither it nor a name that comes with it, which `names_of` gives, is in `taken`, or a derivative of such a name.
     """
     plain = re.sub(r"\W", "_", unicodedata.normalize("NFKC", name))
     plain = f"j_{plain}" if not plain.isidentifier() or keyword.iskeyword(plain) or plain in ARGUMENTS else plain

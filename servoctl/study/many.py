@@ -61,7 +61,7 @@ def simulate_many(
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
     method : Method or str, optional
-        Default: `Taylor()`; for a program that determines the motion completely "algebraic".
+        Default: `sv.methods.Taylor()`; for a program that determines the motion completely "algebraic".
     t_eval : (K,) array, optional
         Times of the traces [s]; default: no traces.
     executor : int or concurrent.futures.Executor, optional

@@ -54,7 +54,7 @@ class StabilityMap(Shown):
 
         Parameters
         ----------
-        drift : None, "project", float, `Project(...)` or `Poles(...)`, optional
+        drift : None, "project", float, `sv.methods.Project(...)` or `sv.methods.Poles(...)`, optional
             Constraint violations count where poles govern them: without treatment they are neutral under every method,
             and projection removes them.
         """

@@ -183,7 +183,7 @@ class Reference:
         self.row_levels = [0] * n + [1] * n + [-10] * self.n_extra + [order - 1 for order in (*orders, *made)]
 
     def _reach(self):
-        """How many effects the actuators have, but at single states: the most of a few about the guess."""
+        """The number of effects that the actuators have: the largest at some states near the guess."""
         moves = np.random.default_rng(0).normal(0, 0.3, (3, self.n)) * self.case.sizes[0]
         speeds = np.array(self.case.speeds)[:, None]
         return max(self.ranks(0.1, self.case.guess + move, speeds)["reach"] for move in moves)
