@@ -269,12 +269,10 @@ def _stays(model, t, x):
     rates, n_x, p = model.function("ode").expression, len(model.state_names), model.parameters
     slow = STILL * (1.0 + np.abs(x[:n_x]))
 
-    given = [k for k, (_, level) in enumerate(model.signals("residuals")[0]) if level == 0]  # not their derivatives
-
     def largest(at, rate):
-        residuals = model.signals("residuals", rate)[1].expression
-        still = np.append(x[:n_x], np.zeros(residuals.numel_in(1) - n_x))
-        values = np.abs(residuals(at, still, p).full()).ravel()
+        names, f = model.signals("residuals")[0], model.signals("residuals", rate)[1].expression
+        still = np.append(x[:n_x], np.zeros(f.numel_in(1) - n_x))
+        values, given = np.abs(f(at, still, p).full()).ravel(), [level == 0 for _, level in names]
         return values[given if rate else slice(None)].max(initial=0.0)
 
     def stays(at):
