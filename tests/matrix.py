@@ -157,13 +157,14 @@ def from_other_guesses(name, log):
     left = {label: part for part in PARTS if not log.has(name, label := f"guess off by {part:+.0%}")}
     run, facts, _ = plan(build, scene.t_span, known, {}) if left else (None, {}, {})
     start = sv.derive(*build, known or None).start(scene.t_span[0], known) if run is not None else None
-    free = [n for n in start.names if n in {*known, *start.free}] if start else ()
+    rates = np.abs(run.jets[build[0].q.nq :]) if start else np.zeros((1, 1))
+    moves = rates[:, 0].max() > 1e-3 * rates.max()  # a bounded motion has almost left its rest
+    free = start.free if moves else [n for n in start.names if n in {*known, *start.free}] if start else ()
     for label, part in left.items() if free else ():
         sizes = [np.ptp(run[n]) or np.abs(run[n]).max() or 1.0 for n in free]
         signs = [1.0 if part > 0 else -((-1.0) ** i) for i in range(len(free))]
         guess = {n: float(start[n] + abs(part) * s * d) for n, s, d in zip(free, signs, sizes, strict=True)}
-        rates = np.abs(run.jets[build[0].q.nq :])
-        if rates[:, 0].max() > 1e-3 * rates.max():  # a bounded motion has almost left its rest
+        if moves:
             log.add(name, label, **_in_motion(build, scene, guess))
         else:
             other, facts_there, more = plan(build, scene.t_span, guess, {})

@@ -185,3 +185,16 @@ def test_the_rest_after_a_path_is_where_the_path_ends(unit):
     model = sv.derive(machine, program)
     rest = sv.report(model, model.start()).basis.rest["end"]
     assert (unit * rest.x[:2]).tolist() == pytest.approx([5.0, 2.0], rel=1e-12)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0, -1.0, 1e3, 1e5, 1e6])
+def test_the_orders_of_a_satellite_do_not_hang_on_where_the_earth_lies(shift):
+    """What falls with a power of the distance has no usual size: a guess of y that is small led 1e27 m away."""
+    p, q = sv.parameters(m=100.0, mu=3.986e14), sv.coordinates("x y")
+    place, acceleration = ca.vertcat(*q) + shift, q.dt(ca.vertcat(*q), 2)
+    mechanism = sv.Mechanism(q, sv.particle(q, p.m, place), potential=-p.m * p.mu / ca.norm_2(place), parameters=p)
+    program = sv.Program({"steady": ca.dot(acceleration, q.dt(ca.vertcat(*q), 3))}, by="ideal")
+    known = {"x": 7e6 - shift, "y": -shift, "dx": 0.0, "dy": 8266.372624, "d2y": 0.0}
+    model = sv.derive(mechanism, program, {**known, "d2x": -8.13})
+    assert [row.order for row in model.reduction.rows] == [3, 2]
+    assert model.start(guess={"d2x": -8.13}, **known).free == ("d2x",)

@@ -49,13 +49,16 @@ def usual(mechanism, program, guess, values, window):
     if terms.f.has_free():
         return Scales(np.ones(mechanism.q.nq), np.ones(mechanism.q.n))
     wishes, weights = terms.wishes(guess)
-    logs = np.linalg.lstsq(weights, wishes, rcond=None)[0]
+    guessed = np.linalg.lstsq(weights, wishes, rcond=None)[0]
+    logs = guessed.copy()
     for _ in range(ROUNDS):
         scales = terms.scales(logs)
         step = _balanced(terms.contributions(scales, window(scales.time)), terms.unknowns, logs, wishes, weights)
         logs += step / 2
         if np.abs(step).max() < ALIKE:
             break
+    else:  # as of rows that fall with a power of the distance, along which no size is the last
+        logs = guessed
     logs = np.where(np.abs(logs) < np.log(ORDINARY), 0.0, logs)
     return terms.scales(np.where(terms.bounded(logs, window), 0.0, logs))
 
