@@ -179,8 +179,8 @@ class _Checks:
         velocities, accelerations = (self.sizes[model.nq + k * model.n :][: model.n] for k in (0, 1))
         self.balanced = law <= CONSERVED * max(rate, size, (self.mass * velocities * accelerations).max())
         self.energies = np.concatenate([at.signals("energy") for at in self.samples], axis=1)[0]
-        self.energy_size = max((self.mass * velocities**2).max() / 2, np.ptp(self.energies))
-        self.energy_size += ROUNDING / LIMITS["energy"] * terms
+        size = max((self.mass * velocities**2).max() / 2, np.ptp(self.energies))
+        self.energy_size = size + ROUNDING / LIMITS["energy"] * terms or 1.0
         self.instants = self.samples
         if len(run.t) > 1:
             self.edges = self._edges(segments)
@@ -247,7 +247,7 @@ class _Checks:
         gained = np.diff(self.energies, prepend=self.energies[0]) if self.balanced else np.zeros(len(run.t))
         known[:, sampled] = np.vstack([run.jets[:n_x], gained])
         of_work = self.energy_size / len(t) * LIMITS["energy"] / LIMITS["segments"]
-        sizes = np.append(self.sizes[:n_x], of_work or 1.0)
+        sizes = np.append(self.sizes[:n_x], of_work)
         steps = max(-(-segments // (len(t) - 1)), 1 + -(-OWN_INSTANTS // (len(t) - 1)))
         return Edges(t, sampled, known, sizes, LIMITS["segments"], steps)
 
