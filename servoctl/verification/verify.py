@@ -257,11 +257,10 @@ class _Checks:
         Each attempt is a function of the indices (K,) of edges and returns pairs of a flow and of those that it leads
         on. Edges lie on all switches, so that the model itself is smooth between them.
         """
-        variants = [self.model if self.family else v for *_, v in self.run.variants]
+        variants = [self.model if self.family and not self.flat else v for *_, v in self.run.variants]
         first = np.array([next(i for i, v in enumerate(variants) if v is variant) for variant in variants])  # the same
         sample = np.cumsum(self.edges.sampled) - 1
         of = np.searchsorted([a for a, *_ in self.run.variants], sample, side="right") - 1
-        allowance = [MOST_OWN_PIVOTS]
 
         def flow(model):
             return Flow(model, self.flat, self.balanced)
@@ -272,12 +271,14 @@ class _Checks:
             return [(flow(variants[j]), ks[model == j]) for j in np.unique(model)]
 
         def own_sides(ks):  # whose residuals count, in which angles may have turned round
-            return [(flow(self._side_after(self.edges.t[k : k + 2].mean(), sample[k])), [k]) for k in ks]
+            ks = ks[first[of[ks]] != first[of[np.searchsorted(sample, sample[ks] + 1)]]]
+            t = (self.edges.t[ks] + self.edges.t[ks + 1]) / 2
+            z = np.array([self.run.at(instant) for instant in t]).T
+            return [(flow(model), ks[which]) for model, which in self._sides(self.model, t, z)]
 
         def own_pivots(ks):
             found = []
-            for k in ks[: allowance[0]]:
-                allowance[0] -= 1
+            for k in ks[:MOST_OWN_PIVOTS]:
                 with contextlib.suppress(ServoError):
                     at = self.run.jets[: len(self.model.jet_names), sample[k]]
                     found.append((flow(self.model.near(self.run.t[sample[k]], at)), [k]))
@@ -285,14 +286,6 @@ class _Checks:
 
         sides = [own_sides] if self.flat and self.family else []
         return [*sides, next_to, partial(next_to, shift=1), own_pivots]
-
-    def _side_after(self, t, sample):
-        """The variant of a run with switches at t [s], after a sample."""
-        before, after = (self.run.variant(k) for k in (sample, min(sample + 1, len(self.run.t) - 1)))
-        if before is after:
-            return before
-        x = self.run.at(t)[: len(self.model.state_names)]
-        return self.family.at(self.family.branches(t, x, sides(self.model, before)))
 
     def _own(self):
         """Instants inside the intervals, some OWN_INSTANTS of them, by variant."""
