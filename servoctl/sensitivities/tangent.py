@@ -42,16 +42,11 @@ class Tangent:
 
     def __init__(self, equations, names, S=None):
         self.e, self.symbols = equations, parameter_symbols(equations, names)
-        levels = range(equations.top + 1)
-        if S is None:
-            known = []
-            for j in levels:
-                known.append(self._level(j, known))
-            self.jets = ca.vertcat(*known)
-        else:
-            sizes = [equations.q.nq, *[equations.q.n] * (equations.top - 1)]
-            known = ca.vertsplit(S, np.cumsum([0, *sizes]).tolist())
-            self.jets = ca.vertcat(S, self._level(equations.top, known))
+        sizes = [equations.q.nq, *[equations.q.n] * (equations.top - 1)]
+        known = [] if S is None else ca.vertsplit(S, np.cumsum([0, *sizes]).tolist())
+        for j in range(len(known), equations.top + 1):
+            known.append(self._level(j, known))
+        self.jets = ca.vertcat(*known)
 
     def _level(self, j, known):
         """∂γ^(j), or ∂q, from the tangents of the jets below."""
