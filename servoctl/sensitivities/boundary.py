@@ -13,7 +13,7 @@ from servoctl.errors import SpecificationError, UnstableInternalDynamics
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded
 from servoctl.methods.radau import basis
-from servoctl.sensitivities.tangent import invariants_by, parameter_symbols, start_of
+from servoctl.sensitivities.tangent import invariants_by, kept, parameter_symbols, start_of
 from servoctl.tolerances import CUTOFF
 
 SAME_MOTION = 1e-3  # of its size: a run that differs by more is not the bounded motion of its program
@@ -81,14 +81,11 @@ class _Linear:
         return self.held + self.tangent @ dz
 
 
+@kept
 def _rates_by(model, names):
     """∂X'/∂X and ∂X'/∂p, column by column, as a function of (t, X, p)."""
-
-    def build():
-        e = model.equations
-        rates = e.ode()(e.q.t, e.state, e.parameters)[: e.state.numel()]
-        both = ca.vertcat(e.state, parameter_symbols(e, names))
-        f = e.function("rates_by", e.state, [ca.vec(ca.densify(ca.jacobian(rates, both)))])
-        return compiled(f, "rates_by", ("rk",))  # which is evaluated at many points, and therefore compiled
-
-    return model.once(f"rates by {' '.join(names)}", build)
+    e = model.equations
+    rates = e.ode()(e.q.t, e.state, e.parameters)[: e.state.numel()]
+    both = ca.vertcat(e.state, parameter_symbols(e, names))
+    f = e.function("rates_by", e.state, [ca.vec(ca.densify(ca.jacobian(rates, both)))])
+    return compiled(f, "rates_by", ("rk",))  # which is evaluated at many points, and therefore compiled

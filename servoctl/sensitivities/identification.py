@@ -223,14 +223,6 @@ def _require_inertia(plant, names, theta):
     plant.equations.require_inertia(_numbers(plant, names, theta)[: len(plant.mechanism.parameters.names)])
 
 
-def _has_inertia(plant, names, theta):
-    try:
-        _require_inertia(plant, names, theta)
-    except SpecificationError:
-        return False
-    return True
-
-
 class _Problem:
     """Residuals of records, cut into pieces, as functions of (parameters, first states), with their Jacobian."""
 
@@ -284,7 +276,9 @@ class _Problem:
     def _evaluated(self, unknowns):
         """Residuals and their derivatives; infinite where the plant is none, so that no search goes there."""
         if self._latest[0] is None or not np.array_equal(self._latest[0], unknowns):
-            if not _has_inertia(self.plant, self.names, unknowns[: self.k]):
+            try:
+                _require_inertia(self.plant, self.names, unknowns[: self.k])
+            except SpecificationError:
                 count = len(self.noise) * sum(len(piece.t) for _, _, piece in self.pieces)
                 return np.full(count, np.inf), np.full((count, len(unknowns)), np.inf)
             values, slopes = [], []
@@ -462,7 +456,10 @@ def _determined(names, by_parameters, by_starts):
 
     What first states explain is taken out of the derivatives by the parameters.
     """
-    Q = _range(by_starts)
+    from scipy.linalg import orth
+
+    lengths = np.linalg.norm(by_starts, axis=0)
+    Q = orth(by_starts / np.where(lengths > 0, lengths, 1.0))
     _, singular, directions = np.linalg.svd(by_parameters - Q @ (Q.T @ by_parameters), full_matrices=False)
     deviations = 1 / np.maximum(singular, TINY)
     seen = deviations <= UNSEEN
@@ -471,13 +468,6 @@ def _determined(names, by_parameters, by_starts):
     parts = [{n: float(d) for n, d in zip(names, v, strict=True) if abs(d) > TAKES_PART} for v in directions[~seen]]
     lost = (np.abs(directions[~seen]) > TAKES_PART).any(axis=0)
     return covariance, np.where(lost, np.inf, np.sqrt(np.diag(covariance))), tuple(parts)
-
-
-def _range(matrix):
-    """An orthonormal basis of the range of a matrix."""
-    size = np.linalg.norm(matrix, axis=0)
-    U, singular, _ = np.linalg.svd(matrix / np.where(size > 0, size, 1.0), full_matrices=False)
-    return U[:, singular > np.finfo(float).eps * len(matrix) * singular.max(initial=0.0)]
 
 
 def _with_numbers(plant, numbers):

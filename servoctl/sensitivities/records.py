@@ -32,7 +32,8 @@ class Record:
     def pieces(self, count):
         """The record cut into at most `count` pieces, each with a first state of its own: (first sample, piece)."""
         length = max(-(-len(self.t) // count), 2)
-        return [(a, self._samples(a, min(a + length, len(self.t)))) for a in range(0, len(self.t) - 1, length)]
+        cuts = [*range(0, len(self.t) - 1, length), len(self.t)]
+        return [(a, self._samples(a, b)) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
 
     def _samples(self, a, b):
         """The samples a .. b - 1."""
@@ -171,12 +172,10 @@ def _guesses(plant, data, guess, start):
 
 def _line_slopes(t, values):
     """Slopes (N,) of straight lines through the samples around each one."""
-    result = np.empty(len(t))
-    for k in range(len(t)):
-        near = slice(max(k - AROUND, 0), k + AROUND + 1)
-        s = t[near] - t[near].mean()
-        result[k] = s @ values[near] / (s @ s)
-    return result
+    from scipy.signal import savgol_filter
+
+    around = min(AROUND, (len(t) - 1) // 2)
+    return savgol_filter(values, 2 * around + 1, 1, deriv=1, delta=t[1] - t[0])
 
 
 def _checked(plant, data, noise):

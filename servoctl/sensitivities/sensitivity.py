@@ -15,7 +15,7 @@ from servoctl.methods.sizes import motion_sizes
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
-from servoctl.sensitivities.tangent import along_state, determined, invariants_by, start_of, variational
+from servoctl.sensitivities.tangent import invariants_by, start_of, tangent_at, variational
 from servoctl.values import Value, frozen
 
 RTOL = 1e-11  # of a step of the variational equation
@@ -199,12 +199,8 @@ def sensitivity(run: Run, of: str | Sequence[str] | None = None, to: str | Seque
             raise unknown(name, (*model.numbers, *model.state_names), "parameter or initial value")
     names = tuple(name for name in to if name in model.numbers)
     kinds = tuple(dict.fromkeys(model.signal_groups[name] for name in of if name not in model.jet_names))
-    if model.flat:
-        _require_free(model, initial, ())
-        tangents, independent = _by_theorem(run, names, kinds), ()
-    else:
-        tangents, independent = _along(model, run, (names, initial), kinds)
-    rows = dict(zip(_rows(model, kinds), tangents, strict=True))
+    S, independent = _of_state(model, run, names, initial)
+    rows = dict(zip(_rows(model, kinds), _tangents(run, S, names, initial, kinds), strict=True))
     columns = (*names, *initial)
     values = {(a, b): rows[a][columns.index(b)] for a in of for b in to}
     return Sensitivity(run, of, to, values, independent)
@@ -225,47 +221,32 @@ def _rows(model, kinds):
     return [*model.jet_names, *(name for kind in kinds for name in model.signals(kind)[0])]
 
 
-def _variants(run):
-    return run.variants or ((0, len(run.t), run.model),)
-
-
-def _by_theorem(run, names, kinds):
-    """Tangents (rows, k, N) of the jets and signals of a flat program."""
-    parts = []
-    for first, end, model in _variants(run):
-        jets = run.jets[: len(model.jet_names), first:end]
-        y = determined(model, names, kinds).grid(run.t[first:end], jets, model.parameters)
-        parts.append(_by_rows(model, y, len(names), kinds))
+def _tangents(run, S, names, initial, kinds):
+    """Tangents (rows, K, N) of jets and signals at the samples, from those S (n_x, K, N) of the state."""
+    parts, K = [], len(names) + len(initial)
+    for first, end, model in run.variants or ((0, len(run.t), run.model),):
+        f, t = tangent_at(model, names, len(initial), kinds), run.t[first:end]
+        of_state = S[:, :, first:end].swapaxes(0, 1).reshape(-1, len(t))
+        y = f.grid(t, np.concatenate([run.jets[: len(model.jet_names), first:end], of_state]), model.parameters)
+        sizes = [len(model.jet_names), *(len(model.signals(kind)[0]) for kind in kinds)]
+        blocks = zip(np.split(y, np.cumsum(sizes[:-1]) * K), sizes, strict=True)
+        parts.append(np.concatenate([block.reshape(K, size, -1).swapaxes(0, 1) for block, size in blocks]))
     return np.concatenate(parts, axis=2)
 
 
-def _by_rows(model, y, columns, kinds):
-    """Tangents (rows, K, N) from outputs y whose matrices are stacked column by column."""
-    sizes = [len(model.jet_names), *(len(model.signals(kind)[0]) for kind in kinds)]
-    parts = np.split(y, np.cumsum([size * columns for size in sizes])[:-1])
-    pairs = zip(parts, sizes, strict=True)
-    return np.concatenate([part.reshape(columns, size, y.shape[1]).swapaxes(0, 1) for part, size in pairs])
+def _of_state(model, run, names, initial):
+    """The tangent (n_x, K, N) of the state along a run, without rows where the program determines it.
+
+    Returns with it the names of the initial values that do not depend on others.
+    """
+    if not model.flat and run.method != str(Bounded()):
+        S, independent = _tangent_at_start(run, names, initial)
+        return _integrated(model, run, names, S), independent
+    _require_free(model, initial, ())
+    return np.zeros((0, len(names), len(run.t))) if model.flat else bounded_tangent(model, run, names), ()
 
 
 # --- programs that leave something to integrate -----------------------------------------------------------------------
-
-
-def _along(model, run, to, kinds):
-    """Tangents (rows, K, N) along a run, and the names of its independent initial values."""
-    names, initial = to
-    if run.method == str(Bounded()):
-        _require_free(model, initial, ())
-        tangents, independent = bounded_tangent(model, run, names), ()
-    else:
-        S, independent = _tangent_at_start(run, names, initial)
-        tangents = _integrated(model, run, names, S)
-    parts = []
-    for first, end, variant in _variants(run):
-        jets = run.jets[: len(model.jet_names), first:end]
-        x = np.concatenate([jets, tangents[:, :, first:end].swapaxes(0, 1).reshape(-1, end - first)])
-        y = along_state(variant, names, len(initial), kinds).grid(run.t[first:end], x, variant.parameters)
-        parts.append(_by_rows(model, y, tangents.shape[1], kinds))
-    return np.concatenate(parts, axis=2), independent
 
 
 def _tangent_at_start(run, names, initial):
@@ -292,20 +273,18 @@ def _tangent_at_start(run, names, initial):
 
 def _dependent(G, ranks):
     """Indices (m,) of the entries that the Jacobian G (m, n_x) of the invariants determines, of low rank first."""
+    from scipy.linalg import qr
+
     size = np.linalg.norm(G, axis=1, keepdims=True)
-    rest, chosen = G / np.where(size > 0, size, 1.0), []
+    rest, ranks, chosen = G / np.where(size > 0, size, 1.0), np.array(ranks), []
     original = np.linalg.norm(rest, axis=0)
-    for rank in sorted(set(ranks)):
-        columns = [i for i, r in enumerate(ranks) if r == rank]
-        while columns and len(chosen) < len(G):
-            norms = np.linalg.norm(rest[:, columns], axis=0) / np.where(original[columns] > 0, original[columns], 1.0)
-            if norms.max() < DEPENDS:
-                break
-            i = columns[int(np.argmax(np.linalg.norm(rest[:, columns], axis=0)))]
-            direction = rest[:, i] / np.linalg.norm(rest[:, i])
-            rest = rest - np.outer(direction, direction @ rest)
-            chosen.append(i)
-            columns.remove(i)
+    for rank in np.unique(ranks) if len(G) else ():
+        columns = np.flatnonzero(ranks == rank)
+        Q, R, order = qr(rest[:, columns], mode="economic", pivoting=True)
+        columns = columns[order[: len(R)]]
+        independent = np.abs(np.diag(R)) > DEPENDS * original[columns]
+        chosen += columns[independent].tolist()
+        rest = rest - Q[:, independent] @ (Q[:, independent].T @ rest)
     return np.sort(chosen).astype(int)
 
 
@@ -407,15 +386,10 @@ def _knot_rate(model, run, name, t):
 
 def _between(run, values, t):
     """A signal (N,) at t [s], by the polynomial through the samples around it between two knots."""
-    if not np.isfinite(t):
-        return float("nan")
-    times, i = run.t, int(np.argmin(np.abs(run.t - t)))
+    from scipy.interpolate import barycentric_interpolate
+
     low = max((knot for knot in run.knots if knot <= t), default=-np.inf)
     high = min((knot for knot in run.knots if knot >= t), default=np.inf)
-    inside = np.flatnonzero((times >= low) & (times <= high) & np.isfinite(values))
-    if times[i] == t or len(inside) < 2:
-        return float(values[i])
-    first = int(np.clip(np.searchsorted(inside, i) - STENCIL // 2, 0, max(0, len(inside) - STENCIL)))
-    window = inside[first : first + STENCIL]
-    s = (times[window] - t) / np.ptp(times[window])
-    return float(np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1])(0.0))
+    inside = np.flatnonzero((run.t >= low) & (run.t <= high) & np.isfinite(values))
+    window = inside[np.argsort(np.abs(run.t[inside] - t))[:STENCIL]]
+    return float(barycentric_interpolate(run.t[window], values[window], t)) if len(window) else float("nan")

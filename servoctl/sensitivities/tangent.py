@@ -10,6 +10,8 @@ the program determines the motion. Otherwise the tangent S of the state obeys th
 S' = ∂f/∂X S + ∂f/∂p, and the highest level alone follows from L.
 """
 
+from functools import wraps
+
 import casadi as ca
 import numpy as np
 
@@ -40,16 +42,11 @@ class Tangent:
 
     def __init__(self, equations, names, S=None):
         self.e, self.symbols = equations, parameter_symbols(equations, names)
-        levels = range(equations.top + 1)
-        if S is None:
-            known = []
-            for j in levels:
-                known.append(self._level(j, known))
-            self.jets = ca.vertcat(*known)
-        else:
-            sizes = [equations.q.nq, *[equations.q.n] * (equations.top - 1)]
-            known = ca.vertsplit(S, np.cumsum([0, *sizes]).tolist())
-            self.jets = ca.vertcat(S, self._level(equations.top, known))
+        sizes = [equations.q.nq, *[equations.q.n] * (equations.top - 1)]
+        known = [] if S is None else ca.vertsplit(S, np.cumsum([0, *sizes]).tolist())
+        for j in range(len(known), equations.top + 1):
+            known.append(self._level(j, known))
+        self.jets = ca.vertcat(*known)
 
     def _level(self, j, known):
         """∂γ^(j), or ∂q, from the tangents of the jets below."""
@@ -79,63 +76,49 @@ class Tangent:
         return self.along(expressions, [self.e.jets], [self.jets])
 
 
-def determined(model, names, kinds):
-    """The compiled tangent of a flat model's jets and groups of signals by parameters, and its sizes (m,).
+def kept(build):
+    """A function of a model, and of names and numbers, whose value is built once for each."""
 
-    Outputs ∂Z/∂p, then those of the signals of each group, column by column.
+    @wraps(build)
+    def found(model, *of):
+        return model.once(f"{build.__name__} {of}", lambda: build(model, *of))
+
+    return found
+
+
+@kept
+def tangent_at(model, names, initial, kinds):
+    """The compiled tangent of jets and groups of signals at a state and its tangent S: a function of t, (Z, S), p.
+
+    The columns of S are by the parameters `names`, then by `initial` initial values; a flat model has no S. Outputs
+    ∂Z, then those of the signals of each group, column by column.
     """
-
-    def build():
-        e = model.equations
-        tangent = Tangent(e, names)
-        parts = [tangent.jets, *(tangent.of(ca.vertcat(*SIGNALS[kind](e)[1])) for kind in kinds)]
-        f = e.function("tangent", e.jets, [ca.vec(ca.densify(part)) for part in parts])
-        return compiled(f, "tangent", ("rk",))  # which is evaluated at many points, and therefore compiled
-
-    return model.once(f"tangent of {' '.join(kinds)} by {' '.join(names)}", build)
+    e = model.equations
+    S = ca.SX(0, 0) if model.flat else ca.SX.sym("S", e.state.numel(), len(names) + initial)
+    tangent = Tangent(e, names, None if model.flat else S)
+    parts = [tangent.jets, *(tangent.of(ca.vertcat(*SIGNALS[kind](e)[1])) for kind in kinds)]
+    f = e.function("tangent", ca.vertcat(e.jets, ca.vec(S)), [ca.vec(ca.densify(part)) for part in parts])
+    return compiled(f, "tangent", ("rk",) if model.flat else ())  # all its samples at once are worth compiling
 
 
-def along_state(model, names, initial, kinds):
-    """The tangent of jets and signals at a state and its tangent S: a function of t, (Z, S), p.
-
-    The columns of S are by the parameters `names`, then by `initial` initial values; `kinds` are groups of signals.
-    """
-
-    def build():
-        e = model.equations
-        S = ca.SX.sym("S", e.state.numel(), len(names) + initial)
-        tangent = Tangent(e, names, S)
-        parts = [tangent.jets, *(tangent.of(ca.vertcat(*SIGNALS[kind](e)[1])) for kind in kinds)]
-        x = ca.vertcat(e.jets, ca.vec(S))
-        return compiled(e.function("tangent_at", x, [ca.vec(ca.densify(part)) for part in parts]), "tangent_at")
-
-    return model.once(f"tangent at {' '.join(kinds)} by {' '.join(names)} and {initial}", build)
-
-
+@kept
 def variational(model, names, initial):
     """X' and S' as a function of t, (X, S), p: the equations of motion with their variational equations."""
-
-    def build():
-        e = model.equations
-        S = ca.SX.sym("S", e.state.numel(), len(names) + initial)
-        tangent, top = Tangent(e, names, S), ca.vertcat(*e.q.gamma(e.top))
-        rates = e.rates(top)
-        state_rates = e.ode()(e.q.t, e.state, e.parameters)[: e.state.numel()]
-        tangent_rates = ca.substitute(tangent.of(rates), top, state_rates[-e.q.n :])
-        x = ca.vertcat(e.state, ca.vec(S))
-        return compiled(e.function("variational", x, [state_rates, ca.vec(ca.densify(tangent_rates))]), "variational")
-
-    return model.once(f"variational by {' '.join(names)} and {initial}", build)
+    e = model.equations
+    S = ca.SX.sym("S", e.state.numel(), len(names) + initial)
+    tangent, top = Tangent(e, names, S), ca.vertcat(*e.q.gamma(e.top))
+    rates = e.rates(top)
+    state_rates = e.ode()(e.q.t, e.state, e.parameters)[: e.state.numel()]
+    tangent_rates = ca.substitute(tangent.of(rates), top, state_rates[-e.q.n :])
+    x = ca.vertcat(e.state, ca.vec(S))
+    return compiled(e.function("variational", x, [state_rates, ca.vec(ca.densify(tangent_rates))]), "variational")
 
 
+@kept
 def invariants_by(model, names):
     """The invariants of the state, and their Jacobian in X and in parameters, as a function of (t, X, p)."""
-
-    def build():
-        e = model.equations
-        values = ca.vertcat(ca.SX(0, 1), *(expression for _, _, expression in e.invariant_rows))
-        both = ca.vertcat(e.state, parameter_symbols(e, names))
-        slopes = ca.vec(ca.densify(ca.jacobian(values, both)))
-        return compiled(e.function("invariants_by", e.state, [values, slopes]), "invariants_by")
-
-    return model.once(f"invariants by {' '.join(names)}", build)
+    e = model.equations
+    values = ca.vertcat(ca.SX(0, 1), *(expression for _, _, expression in e.invariant_rows))
+    both = ca.vertcat(e.state, parameter_symbols(e, names))
+    slopes = ca.vec(ca.densify(ca.jacobian(values, both)))
+    return compiled(e.function("invariants_by", e.state, [values, slopes]), "invariants_by")

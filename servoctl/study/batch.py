@@ -9,7 +9,7 @@ import numpy as np
 from servoctl.markup import Shown
 from servoctl.study.cases import FAILURE
 from servoctl.study.signals import Signals
-from servoctl.study.table import Study, table
+from servoctl.study.table import Study, machine, table
 from servoctl.values import frozen
 
 FINAL = "final "  # names of values at the end
@@ -62,6 +62,16 @@ def failure(error):
     with contextlib.suppress(Exception):
         columns["facts"] = json.dumps(getattr(error, "details", {}), default=str)
     return columns
+
+
+def of_finished(kind, done, columns, errors, meta):
+    """The study of those of N cases that are done (N,), from columns (N,) and the columns `FAILURE` by index."""
+    which = np.flatnonzero(done)
+    if not len(which):
+        raise KeyboardInterrupt
+    columns = {"case": which} | {name: values[which] for name, values in columns.items()}
+    meta = meta | {"interrupted": len(which) < len(done), "machine": machine()}
+    return Study(kind, columns | failures(errors, which), meta)
 
 
 def failures(errors, which):

@@ -155,10 +155,10 @@ def _case(i, case):
         raise SpecificationError(f"Case {i} is {case!r}.", rule, do=example, case=i)
     values = {}
     for name, value in case.items():
-        if not isinstance(name, str) or not name.isidentifier() or name in RESERVED:
+        if not isinstance(name, str) or name in RESERVED:
             raise SpecificationError(
                 f"Case {i} has a parameter named {name!r}.",
-                f"Names of parameters must be identifiers; {', '.join(RESERVED)} are reserved.",
+                f"Names of parameters are texts; {', '.join(RESERVED)} are reserved.",
                 do="Choose another name.",
                 name=name,
                 case=i,

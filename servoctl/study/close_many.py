@@ -19,10 +19,9 @@ from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
 from servoctl.reduction.ranks import SUSPECT
-from servoctl.study.batch import Batch, failure, failures
-from servoctl.study.cases import CASES, as_cases
-from servoctl.study.executor import computed
-from servoctl.study.table import Study, machine
+from servoctl.study.batch import Batch, failure, of_finished
+from servoctl.study.cases import CASES, as_columns
+from servoctl.study.executor import computed, whole_run
 
 SEEDS = 2**31  # seeds of cases are below this
 
@@ -101,13 +100,12 @@ def close_many(
         "rate": run.law.rate,
         "substeps": loop.substeps,
         "delay": loop.delay,
-        "machine": machine(),
         "units": run.units,
     }
     reasons = _reasons(run, loop, numbers, seeds, gathered) if run.law.allocation else {}
-    study, gathered = _study(columns, seeds, derived.names, gathered, meta, reasons)
-    t = loop.t0 + np.arange(len(gathered.trace)) * every * loop.period
-    return Batch(study, t, dict(zip(record, np.moveaxis(gathered.trace, 1, 0), strict=True)))
+    study = _study(columns, seeds, derived.names, gathered, meta, reasons)
+    t, traces = loop.t0 + np.arange(len(gathered.trace)) * every * loop.period, gathered.trace[..., study["case"]]
+    return Batch(study, t, dict(zip(record, np.moveaxis(traces, 1, 0), strict=True)))
 
 
 def _require(run):
@@ -182,19 +180,14 @@ def _noise(run, seeds):
 
 def _columns(cases):
     """Numbers by name, (N,) each."""
-    if not isinstance(cases, dict):
-        rows = as_cases(cases)
-        cases = {name: [row[name] for row in rows] for name in rows[0]}
-    columns = {name: as_numbers(values) for name, values in mapping(cases, "The cases").items()}
-    sizes = {values.shape for values in columns.values()}
-    one = len(sizes) == 1 and all(len(shape) == 1 and shape[0] for shape in sizes)
-    if not one or not all(np.isfinite(v).all() for v in columns.values()):
+    columns = {name: as_numbers(values) for name, values in as_columns(cases).items()}
+    unfit = [name for name, values in columns.items() if not np.isfinite(values).all()]
+    if unfit or not columns:
         raise SpecificationError(
-            f"The cases {', '.join(map(str, cases)) or '(none)'} are not columns of finite numbers of one length.",
+            f"The cases have no numbers by the names {', '.join(unfit)}." if unfit else "The cases have no columns.",
             "Each column has one finite number per case.",
             do='Pass such columns, as {"m_load": np.linspace(90.0, 110.0, 1000)}, or dicts.',
-            names=tuple(map(str, cases)),
-            shapes=sorted(sizes),
+            names=unfit,
         )
     return columns
 
@@ -269,8 +262,7 @@ def _one_by_one(run, derived, loop, numbers, seeds, traced, every):
                 raise
             ended[0 if isinstance(error, IntegrationStopped) else 1] = error.details["t"]
             return ended, np.nan, np.nan
-        if not one.success:
-            raise KeyboardInterrupt
+        whole_run(one)
         residuals = [one.residual[name][0] for name in (derived.residuals.names if derived.residuals else ())]
         values = np.vstack([one.states, one.inputs, *residuals])
         found = np.abs(values).max(axis=1), np.sqrt(np.mean(values**2, axis=1)), values[:, -1]
@@ -316,21 +308,15 @@ def _reasons(run, loop, numbers, seeds, gathered):
 
 
 def _study(columns, seeds, names, gathered, meta, reasons):
-    """The table, of the finished cases; results of a loop that ended early are NaN."""
-    which = np.flatnonzero(~np.isnan(gathered.state_lost))
-    meta["interrupted"] = len(which) < len(gathered.state_lost)
-    if not len(which):
-        raise KeyboardInterrupt
+    """The table of the finished cases; results of a loop that ended early are NaN."""
     early, of_law = np.minimum(gathered.state_lost, gathered.law_lost), gathered.law_lost < gathered.state_lost
     errors = {i: _ended(early[i], of_law[i]) for i in np.flatnonzero(np.isfinite(early)).tolist()}
     errors |= {i: failure(error) for i, error in reasons.items()}
-    numbers = {"case": np.arange(len(early))} | columns | ({"seed": np.array(seeds)} if seeds else {})
-    numbers = {name: values[which] for name, values in numbers.items()}
-    gathered = Gathered(**{name: values[..., which] for name, values in vars(gathered).items()})
     parts = {"max |{}|": gathered.largest, "rms {}": gathered.rms, "final {}": gathered.last}
     results = {of.format(name): row for of, rows in parts.items() for name, row in zip(names, rows, strict=True)}
-    results = {name: np.where(np.isfinite(early[which]), np.nan, values) for name, values in results.items()}
-    return Study("closed loops", numbers | results | failures(errors, which), meta), gathered
+    results = {name: np.where(np.isfinite(early), np.nan, values) for name, values in results.items()}
+    columns = columns | ({"seed": np.array(seeds)} if seeds else {}) | results
+    return of_finished("closed loops", ~np.isnan(gathered.state_lost), columns, errors, meta)
 
 
 def _ended(t, of_law):

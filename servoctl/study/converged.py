@@ -1,7 +1,6 @@
 """Converged motions of the models of one scene, and how far other motions are from that of the first."""
 
 import functools
-import itertools
 import time
 
 import numpy as np
@@ -12,10 +11,11 @@ from servoctl.methods.accuracy import component_sizes, relative_error
 from servoctl.methods.choice import Adaptive, Algebraic, Project, Taylor
 from servoctl.methods.sizes import state_levels
 from servoctl.simulation import consistent_state, simulated
+from servoctl.study.executor import whole_run
+from servoctl.verification import verify
 
 INSTANTS = 51  # samples of adaptive methods while they are timed
 COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, and where in its interval each lies
-DENSE = 1001  # instants of a motion over which its power is integrated
 CHECKS = (Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14))  # of a motion, in this order
 
 
@@ -58,23 +58,6 @@ class Converged:
             self._runs[key] = whole_run(run)
         return self._runs[key]
 
-    @functools.cached_property
-    def energy_balance(self):
-        """Largest difference between the energy gained and the work of all forces, relative to the energy (splines)."""
-        from scipy.interpolate import make_interp_spline
-
-        run = self.at(np.union1d(np.linspace(*self.span, DENSE), self.knots))
-        order = np.argsort(run.t)
-        t, work, energy = run.t[order], run.signals("power")[1][1][order], run["energy"][order]
-        gained, cuts = [0.0], [t[0], *self.knots, t[-1]]
-        for a, b in itertools.pairwise(cuts):
-            piece = (t >= a) & (t <= b)
-            if piece.sum() < 2:
-                return np.nan
-            spline = make_interp_spline(t[piece], work[piece], k=min(9, (piece.sum() - 1) // 2 * 2 - 1 or 1))
-            gained += list(gained[-1] + spline.antiderivative()(t[piece])[1:])
-        return float(np.abs(energy - energy[0] - gained).max() / max(np.abs(energy).max(), 1e-300))
-
 
 class Deadline:
     """A `progress` for `simulate` that stops a run some seconds after its first step."""
@@ -89,13 +72,6 @@ class Deadline:
         if now - self.since > self.seconds:
             late = f"More than {self.seconds:g} s: ended at t = {t:.4g} s"
             raise LimitExceeded(late, seconds=self.seconds, steps=self.steps, t=t)
-
-
-def whole_run(run):
-    """The run, if it reached its end; one that Ctrl-C stopped ends the study."""
-    if not run.success:
-        raise KeyboardInterrupt
-    return run
 
 
 class Comparison:
@@ -149,7 +125,7 @@ class Comparison:
             "verified by": in_words(first.checked_by),
             "error": max(self.off(*pair) for pair in pairs),
             "actuation": float(np.fmax.reduce([self.forces_off(*pair) for pair in pairs], initial=0.0)),
-            "energy": first.energy_balance,
+            "energy": verify(first.at(first.times)).numbers.get("energy", np.nan),
         }
 
 

@@ -89,6 +89,13 @@ def _recorded_interrupts():
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def whole_run(run):
+    """The run, if it reached its end; one that Ctrl-C stopped ends what it is part of."""
+    if not run.success:
+        raise KeyboardInterrupt
+    return run
+
+
 def require_some(lost, finished, count):
     """Refuse what an executor left that finished none of `count` cases; `lost` has the columns `FAILURE` of calls."""
     if not lost or finished:

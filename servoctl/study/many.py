@@ -11,7 +11,7 @@ from servoctl.checks import as_numbers, as_span, mapping, meant, plain, require_
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
 from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
-from servoctl.methods.lanes import OF_A_CASE, fits, integrate, plan_many, plans_fit
+from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
 from servoctl.model.model import Model
@@ -21,11 +21,10 @@ from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
-from servoctl.study.batch import FINAL, Batch, failure, failures
+from servoctl.study.batch import FINAL, Batch, failure, of_finished
 from servoctl.study.cases import as_columns
-from servoctl.study.executor import computed, require_some
+from servoctl.study.executor import computed, require_some, whole_run
 from servoctl.study.signals import Signals
-from servoctl.study.table import Study, machine
 
 SHARES = 16  # of the cases, which the workers of an executor share
 
@@ -90,20 +89,21 @@ def simulate_many(
     if executor is not None and not isinstance(executor, Executor):
         executor = whole("executor", executor, least=1)
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
-    times = _trace_times(span, t_eval)
-    motions = _Many(model, *_case_table(model, starts, parameters), len(times))
+    times = sample_times(*span, t_eval, ()).copy() if np.size(t_eval) and t_eval is not None else np.array([])
+    all_times = times if len(times) and times[-1] == span[1] else np.append(times, span[1])
+    motions = _Many(model, *_case_table(model, starts, parameters), len(all_times))
     with progress_bar("simulate_many", progress, motions.n, unit="case") as bar:
 
         def show(count):
             bar.update(count - bar.n)
 
         if isinstance(executor, Executor):
-            motions.on(executor, (span, method, times), show)
+            motions.on(executor, (span, method, all_times), show)
         else:
-            motions.compute(span, method, times, executor, show)
+            motions.compute(span, method, all_times, executor, show)
+    study = motions.study({"t_span": list(span), "by": str(method)})
     level = max(getattr(method, "jets", None) or 0, model.reduction.top)
-    meta = {"t_span": list(span), "by": str(method), "interrupted": motions.interrupted}
-    return motions.result(span, times, level, meta)
+    return Batch(study, times, motions.signals(study["case"], all_times, len(times), level))
 
 
 def _share_computed(part, span, method, times):
@@ -138,15 +138,6 @@ def _case_table(model, starts, parameters):
     return n, columns, starts
 
 
-def _trace_times(span, t_eval):
-    return np.array([]) if t_eval is None or not np.size(t_eval) else sample_times(*span, t_eval, ()).copy()
-
-
-def _with_end(times, span):
-    """Times (K,) in the order of the motion, with its end."""
-    return times if len(times) and times[-1] == span[1] else np.append(times, span[1])
-
-
 class _Many:
     """The cases, and what is known of their motions so far."""
 
@@ -155,7 +146,7 @@ class _Many:
         self.interrupted, n_x = False, len(model.state_names)
         self.done, self.steps, self.errors, self.runs = np.zeros(n, bool), np.full(n, np.nan), {}, {}
         self.parameters = np.tile(model.parameters, (n, 1))
-        self.final, self.samples = np.full((n, n_x), np.nan), np.full((n, n_times, n_x), np.nan)
+        self.samples = np.full((n, n_times, n_x), np.nan)  # the last one at the end
 
     def model_of(self, i):
         """The model with the parameters of a case; each set of parameters is checked once."""
@@ -207,7 +198,7 @@ class _Many:
 
     def _join(self, which, part):
         """Take the results of a part."""
-        for name in ("done", "steps", "final", "samples", "parameters"):
+        for name in ("done", "steps", "samples", "parameters"):
             getattr(self, name)[which] = getattr(part, name)
         for name in ("errors", "runs"):
             getattr(self, name).update((int(which[i]), value) for i, value in getattr(part, name).items())
@@ -227,28 +218,25 @@ class _Many:
             return
         good = (ends[:, 0] > 0) & (ends[:, 3] <= OFF)
         good &= self._tolerances_fit(span, (x0, p), np.ascontiguousarray(ends[:, -x0.shape[1] :].T), method)
-        self._take(which, ends, samples, good)
+        self._take(which[good], ends[good], samples[good])
 
     def plans(self, span, times, threads, progress):
         """Compute the plans whose pivots do not fall."""
         which, *cases = self._prepared(span)
-        ends, samples, self.interrupted = plan_many(self.model, span, cases, _with_end(times, span), threads, progress)
+        ends, samples, self.interrupted = plan_many(self.model, span, cases, times, threads, progress)
         if ends is not None:
-            self._take(which, ends, samples[:, : len(times)], ends[:, 0] > 0)
+            good = ends[:, 0] > 0
+            self._take(which[good], ends[good], samples[good])
 
-    def _take(self, which, ends, samples, good):
-        """Take what was computed for some cases, as far as it is good."""
-        if good.all():  # as slices, which are no copies
-            good = slice(None)
-        here, n_x = which[good] if len(which) < self.n else good, self.final.shape[1]
-        self.done[here], self.steps[here] = True, ends[good, 1]
-        self.final[here], self.samples[here] = ends[good, len(OF_A_CASE) :][:, :n_x], samples[good]
+    def _take(self, which, ends, samples):
+        """Take what was computed for some cases."""
+        self.done[which], self.steps[which], self.samples[which] = True, ends[:, 1], samples
 
     def _prepared(self, span):
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
         t, span = span[0], (min(span), max(span))
         knots = self.model.require_smooth(span)
-        p, x = self.parameters, np.empty(self.final.shape)
+        p, x = self.parameters, np.empty((self.n, len(self.model.state_names)))
         ready = self._affirmed(p)
         try:
             ready &= self._started(t, x, p)
@@ -261,7 +249,7 @@ class _Many:
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
         which = np.flatnonzero(ready)
-        return (which, x, p) if len(which) == self.n else (which, x[which], p[which])
+        return which, x[which], p[which]
 
     def _started(self, t, x, p):
         """Cases (N,) whose states x (N, n_x) follow for all cases at once; these are set."""
@@ -310,36 +298,26 @@ class _Many:
         self.interrupted = computed(self._one, calls, None, lambda *_: progress(int(self.done.sum())))[1]
 
     def _one(self, i, span, method, times):
-        t_eval = _with_end(times, span)
         try:
             model = self.model_of(i)
-            run = simulated(model, self.start(i, model, span[0]), span, method, t_eval=t_eval, progress=False)
+            run = simulated(model, self.start(i, model, span[0]), span, method, t_eval=times, progress=False)
         except ServoError as error:
             self.errors[i] = failure(error)
         else:
-            if not run.success:
-                raise KeyboardInterrupt
-            states = run.jets[: self.final.shape[1]].T
-            self.final[i], self.steps[i] = states[-1], run.counters.get("steps", np.nan)
-            self.samples[i], self.runs[i] = states[: len(times)], run
+            self.samples[i] = whole_run(run).jets[: self.samples.shape[2]].T
+            self.steps[i], self.runs[i] = run.counters.get("steps", np.nan), run
         self.done[i] = True
 
-    def result(self, span, times, level, meta):
-        """The table of the finished cases, and their signals."""
-        which, names = np.flatnonzero(self.done), self.model.state_names
-        finished = slice(None) if len(which) == self.n else which  # a slice is no copy
-        if not len(which):
-            raise KeyboardInterrupt
-        columns = {"case": which}
-        columns |= {name: np.array(column)[finished] for name, column in self.columns.items()}
-        columns |= {"steps": self.steps[finished]}
-        columns |= {f"{FINAL}{name}": values for name, values in zip(names, self.final[finished].T.copy(), strict=True)}
-        columns |= failures(self.errors, which)
-        samples, t = self.samples[finished], _with_end(times, span)
-        if len(t) > len(times):
-            samples = np.append(samples, self.final[finished, None], axis=1)
-        runs = {int(np.searchsorted(which, k)): run for k, run in self.runs.items() if self.done[k]}
-        states, p = samples.transpose(2, 1, 0), self.parameters[finished].T
-        meta = meta | {"machine": machine(), "units": self.model.reduction.mechanism.units}
-        trace = Signals(self.model, t, len(times), states, p, level, runs)
-        return Batch(Study("motions", columns, meta), times, trace)
+    def study(self, meta):
+        """The table of the finished cases."""
+        columns = {name: np.array(column) for name, column in self.columns.items()} | {"steps": self.steps}
+        names = (f"{FINAL}{name}" for name in self.model.state_names)
+        columns |= dict(zip(names, self.samples[:, -1].T, strict=True))
+        units = self.model.reduction.mechanism.units
+        return of_finished("motions", self.done, columns, self.errors, meta | {"units": units})
+
+    def signals(self, which, t, count, level):
+        """The signals of the finished cases at the instants t, of which the first so many are those of the traces."""
+        runs = {k: self.runs[i] for k, i in enumerate(which.tolist()) if i in self.runs}
+        states, p = self.samples[which].transpose(2, 1, 0), self.parameters[which].T
+        return Signals(self.model, t, count, states, p, level, runs)

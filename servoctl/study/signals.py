@@ -4,12 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from servoctl.run import Run
+from servoctl.run import ByName, Run
 
 MOST_POINTS = 100_000  # of motions and instants at which signals are evaluated in one call
 
 
-class Signals(Mapping):
+class Signals(ByName, Mapping):
     """Signals of N motions at K instants, (K, N) arrays by the names that a `Run` of one motion has.
 
     `t` has the instants [s], then the end of the motions if that is none of them; `states` (n_x, K or K + 1, N) are
@@ -22,12 +22,7 @@ class Signals(Mapping):
         self._states, self._parameters = states, parameters
         self._jet_names = model.names_to(model.nq + level * model.n)
         self._values = dict(zip(model.state_names, states, strict=True))
-
-    def __iter__(self):
-        return iter(dict.fromkeys([*self._jet_names, *self._model.signal_groups]))
-
-    def __len__(self):
-        return len(list(iter(self)))
+        self.names = tuple(dict.fromkeys([*self._jet_names, *model.signal_groups]))
 
     def __getitem__(self, name):
         return self._along(name)[: self._count]
@@ -40,9 +35,6 @@ class Signals(Mapping):
         if name not in self._values:
             self._values.update(self._computed(name))
         return self._values[name]
-
-    def __contains__(self, name):
-        return name in list(iter(self))
 
     def _computed(self, name):
         """The signals (K, N) of a group by name, evaluated for all motions at once where their jets suffice."""

@@ -67,8 +67,7 @@ def sweep(
         If the pool died before the first case was finished.
     """
     cases = as_cases(cases)
-    seed = _seed(case, seed)
-    _require_fitting(case, cases[0], seed)
+    seed = _fitting_seed(case, cases[0], seed)
     _require_sendable(case, executor)
     rows, calls = {}, {i: (case, i, parameters, seed) for i, parameters in enumerate(cases)}
     with progress_bar("sweep", progress, len(cases), unit="case") as bar:
@@ -153,37 +152,35 @@ def name_of(case):
     return getattr(case, "__qualname__", type(case).__qualname__)
 
 
-def _seed(case, seed):
+def _fitting_seed(case, parameters, seed):
+    """The seed of a case with these parameters; refuses parameters that its function does not have, and no seed."""
     try:
-        draws = "rng" in inspect.signature(case).parameters
+        signature = inspect.signature(case)
     except (TypeError, ValueError) as error:
         rule = "A case must be a function of its parameters."
         raise SpecificationError(f"The case is {case!r}.", rule, type=type(case).__name__) from error
-    if draws == (seed is not None):
-        return None if seed is None else whole("seed", seed)
-    given = f"seed = {seed!r} was given" if seed is not None else "No seed was given"
-    raise SpecificationError(
-        f"{given}, and the case {name_of(case)} has {'a' if draws else 'no'} parameter rng.",
-        "The seed is that of rng, the numpy Generator from which a case draws its random numbers.",
-        do="Give a seed." if draws else "Leave the seed out, or draw from rng; monte_carlo(n, seed=...) has its own.",
-        seed=seed,
-        draws=draws,
-    )
-
-
-def _require_fitting(case, parameters, seed):
-    """Refuse parameters that the case's function does not have."""
-    random = {} if seed is None else {"rng": None}
-    try:
-        inspect.signature(case).bind(**parameters, **random)
-    except TypeError as error:
-        call = f"{name_of(case)}{inspect.signature(case)}"
+    draws = "rng" in signature.parameters
+    if draws != (seed is not None):
+        given = f"seed = {seed!r} was given" if seed is not None else "No seed was given"
         raise SpecificationError(
-            f"The cases have the parameters {', '.join(parameters)} for {call}: {error}.",
+            f"{given}, and the case {name_of(case)} has {'a' if draws else 'no'} parameter rng.",
+            "The seed is that of rng, the numpy Generator from which a case draws its random numbers.",
+            do="Give a seed."
+            if draws
+            else "Leave the seed out, or draw from rng; monte_carlo(n, seed=...) has its own.",
+            seed=seed,
+            draws=draws,
+        )
+    try:
+        signature.bind(**parameters, **({"rng": None} if draws else {}))
+    except TypeError as error:
+        raise SpecificationError(
+            f"The cases have the parameters {', '.join(parameters)} for {name_of(case)}{signature}: {error}.",
             "The function is called with the parameters by name.",
             parameters=list(parameters),
             case=name_of(case),
         ) from error
+    return whole("seed", seed) if draws else None
 
 
 def _require_sendable(case, executor):

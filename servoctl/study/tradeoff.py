@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from servoctl.checks import as_span, is_number, mapping, named, positive, positives, require_kind, text
+from servoctl.checks import as_span, mapping, named, positive, positives, require_kind, text
 from servoctl.control.reference import resampled
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.markup import Shown
@@ -25,7 +25,8 @@ from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.progress import progress_bar
 from servoctl.simulation import as_state, simulated
-from servoctl.study.converged import Comparison, Converged, Deadline, whole_run
+from servoctl.study.converged import Comparison, Converged, Deadline
+from servoctl.study.executor import whole_run
 from servoctl.study.table import SHOWN, Study, machine, table
 
 MEASURED = tuple(name for name in METHODS if name != "bounded")  # which solves another problem
@@ -51,21 +52,18 @@ class Recommendation(dict):
         self.row = row
 
 
-def _wanted(error, seconds):
-    """What bounds a recommendation, "error" or "seconds", and its value; exactly one of the two is a number."""
-    if (error is None) == (seconds is None):
+def _wanted(**bounds):
+    """The name and the value of the bound of a recommendation; exactly one is given, a positive number."""
+    given = {name: value for name, value in bounds.items() if value is not None}
+    if len(given) != 1:
         raise SpecificationError(
-            f"error={error!r} and seconds={seconds!r} were given.",
+            f"{', '.join(f'{name}={value!r}' for name, value in bounds.items())} was given.",
             "Exactly one of the two bounds a recommendation.",
             do="Give recommend(error=1e-6) or recommend(seconds=1e-3).",
-            error=error,
-            seconds=seconds,
+            **bounds,
         )
-    wanted, limit = ("error", error) if seconds is None else ("seconds", seconds)
-    if not (is_number(limit) and limit > 0):
-        given, rule = f"{wanted}={limit!r} was given.", "It must be a positive number."
-        raise SpecificationError(given, rule, **{wanted: limit})
-    return wanted, limit
+    [(wanted, limit)] = given.items()
+    return wanted, positive(wanted, limit)
 
 
 class TradeOff(Study):
@@ -141,7 +139,7 @@ class TradeOff(Study):
         LimitExceeded
             If no row reaches it; the message has the nearest one.
         """
-        wanted, limit = _wanted(error, seconds)
+        wanted, limit = _wanted(error=error, seconds=seconds)
         front = self.pareto(of=of)
         reached = front._errors(of) if wanted == "error" else front["seconds"]
         within = np.flatnonzero(reached <= limit)

@@ -4,21 +4,18 @@ import contextlib
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from math import factorial
 
 import numpy as np
 
 from servoctl.checks import whole
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.methods.taylor import series_loop
-from servoctl.model.model import Model
-from servoctl.model.store import fingerprint
+from servoctl.methods.sizes import sizes_of
 from servoctl.model.switching import switching
 from servoctl.progress import stage
 from servoctl.run import SAME_TIME, Run, on_side, require_run, sides
 from servoctl.values import frozen
-from servoctl.verification.between import AGREES, ENOUGH_STEPS, FEW_STEPS, Flow, Integration, between
+from servoctl.verification.between import Edges, Flow, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.remarks import of_loop, of_run
 from servoctl.verification.result import Verification, judged, largest, numbers
@@ -36,8 +33,8 @@ LIMITS = {
 INTEGRATED = 1e-6  # limit for the balance that drift disturbs: γ'' is integrated itself, or rows are hidden
 ROUNDING = 1e-13  # part of the sum of all terms, multiplied out, that is rounding: some hundred roundings
 PROBE, PROBES = 1e-7, 3  # relative change by which a response is measured, and in how many directions
-FLOOR = 1e-3  # least size of a component, relative to what moves as much mass, and to what moves there in the span
-OWN_INSTANTS, MOST_OWN = 200, 8  # instants between samples at which everything is checked, in all and of an interval
+FLOOR = 1e-3  # least size of a component, relative to what carries the same energy (`sizes_of`)
+OWN_INSTANTS = 200  # instants between samples at which everything is checked
 AT_PIVOT_ZERO = 1e-6  # of the least singular value of B: below it B_D is singular, and inputs have no digits
 CONSERVED = 1e-9  # part of dE/dt, relative to its terms, that does not follow from the forces: more is no rounding
 FEW_SIZES = 20  # instants at which the sizes of residuals are measured
@@ -132,47 +129,23 @@ def _required(run):
 
 
 def _variants(model, run, count):
-    """The ranges of samples and their variants; the model alone if those of the run are not its own."""
-    ranges = []
-    for variant in run.variants:
-        if not (isinstance(variant, tuple) and len(variant) == 3 and isinstance(variant[2], Model)):
-            break
-        first, end, of = variant
-        if first >= count or first != (ranges[-1][1] if ranges else 0) or not _same_or_smooth(model, of):
-            break
-        ranges.append((first, min(end, count), of))
-    return tuple(ranges) if ranges and ranges[-1][1] == count else ((0, count, model),)
-
-
-def _same(model, other):
-    """Whether two models have the same specification and numbers, up to the choice of pivots."""
-    if model is other:
-        return True
-    specifications = [(m.reduction.mechanism, m.reduction.program) for m in (model, other)]
-    one = all(a is b for a, b in zip(*specifications, strict=True))
-    alike = one or len({fingerprint(*parts, values=()) for parts in specifications}) == 1
-    return alike and np.array_equal(model.parameters, other.parameters)
-
-
-def _same_or_smooth(model, variant):
-    """Whether a variant is the same model, or the smooth one of its own branches of switches."""
-    with contextlib.suppress(ServoError):
-        return _same(on_side(model, sides(model, variant)), variant)
-    return False
+    """Ranges of samples and their variants, of this model itself: a run says on which sides and near which places."""
+    with contextlib.suppress(ServoError, LookupError, TypeError, ValueError):
+        made = [(a, min(b, count), on_side(model, sides(model, v)).at(v.place)) for a, b, v in run.variants]
+        made = [variant for variant in made if variant[0] < count]
+        if [0, *(end for _, end, _ in made)] == [*(first for first, *_ in made), count]:
+            return tuple(made)
+    return ((0, count, model),)
 
 
 @frozen
 class _Instants:
-    """Instants at which one variant of the model is evaluated: times (N,), jets (n_z, N) and inputs (m, N).
-
-    `first` is the index of the first in the run; None for instants between samples.
-    """
+    """Instants at which one variant of the model is evaluated: times (N,), jets (n_z, N) and inputs (m, N)."""
 
     model: object
     t: np.ndarray
     z: np.ndarray
     inputs: np.ndarray
-    first: int | None = None
 
     @property
     def few(self):
@@ -193,22 +166,29 @@ class _Checks:
         of_series = run.method == "Taylor" and len(run.jets) > len(model.jet_names)
         self.drifts = of_series or model.reduction.top > 2 or (model.reduction.hidden and run.method != "algebraic")
         self.stored, self.fresh = run.stored, replace(run, stored={}, stored_residual={})
-        self.span = abs(run.t[-1] - run.t[0]) or 1.0
         self.samples = [
-            _Instants(v, run.t[a:b], run.jets[:, a:b], inputs, a)
+            _Instants(v, run.t[a:b], run.jets[:, a:b], inputs)
             for (a, b, v), inputs in zip(run.variants, self._inputs(), strict=True)
         ]
         switched = any(sides(model, v) for *_, v in run.variants)
         self.family = switching(model) if switched else None
         self.mass = self._mass()
         self.sizes = self._sizes(self.samples)
-        self.powers = np.concatenate([at.signals("power") for at in self.samples], axis=1)
-        rate, _, size, law, _ = np.abs(self.powers)
-        inertial = self.mass * self.sizes[model.nq :][: model.n] * self.sizes[model.nq + model.n :][: model.n]
-        self.balanced = not np.any(law > CONSERVED * max(rate.max(), size.max(), inertial.max()))
-        self.between, self.sampled, own, self.integrated = self._integrate(segments)
-        self.instants = [*self.samples, *own]
-        self.sizes = self._sizes(self.instants)
+        powers = np.concatenate([at.signals("power") for at in self.samples], axis=1)
+        rate, _, size, law, terms = np.abs(powers).max(axis=1)
+        velocities, accelerations = (self.sizes[model.nq + k * model.n :][: model.n] for k in (0, 1))
+        self.balanced = law <= CONSERVED * max(rate, size, (self.mass * velocities * accelerations).max())
+        self.energies = np.concatenate([at.signals("energy") for at in self.samples], axis=1)[0]
+        size = max((self.mass * velocities**2).max() / 2, np.ptp(self.energies))
+        self.energy_size = size + ROUNDING / LIMITS["energy"] * terms or 1.0
+        self.instants = self.samples
+        if len(run.t) > 1:
+            self.edges = self._edges(segments)
+            self.between = between(self._attempts(), self.edges)
+            self.instants = [*self.samples, *self._own()]
+            self.sizes = self._sizes(self.instants)
+        else:
+            self.doubts.append("one sample is no motion: simulate with more samples")
         if not run.success:
             self.notes.append("the run did not reach its end: errors grow near a singularity")
 
@@ -228,34 +208,17 @@ class _Checks:
 
     def _mass(self):
         """The largest inertia of each velocity along the run, (n,) array."""
-        first, f = self.samples[0], self.samples[0].model.function("matrices")
-        few = np.unique(np.linspace(0, len(first.t) - 1, 16).astype(int))
-        return np.abs(f.grid(first.t[few], first.z[: f.n_x, few], first.model.parameters)[-self.model.n :]).max(axis=1)
+        at, f = self.samples[0], self.samples[0].model.function("matrices")
+        return np.abs(f.grid(at.t[at.few], at.z[: f.n_x, at.few], at.model.parameters)[-self.model.n :]).max(axis=1)
 
     def _sizes(self, instants):
-        """The size of each jet (n_z,): its largest value, at least FLOOR of what others of its level have.
-
-        Levels are compared through the inertia: what carries the same kinetic energy. A level is also at least FLOOR of
-        what the level below would change by in the span.
-        """
-        nq, n = self.model.nq, self.model.n
-        sizes = np.zeros(len(self.run.jets))
+        """The size of each jet (n_z,): its largest value, at least FLOOR of what carries the same kinetic energy."""
+        largest = np.zeros(len(self.run.jets))
         for at in instants:
-            sizes[: len(at.z)] = np.maximum(sizes[: len(at.z)], np.abs(at.z).max(axis=1))
-        plain = self.model.reduction.mechanism.q.plain
-        for first in range(nq, len(sizes), n):
-            level = sizes[first : first + n]
-            below = sizes[first - n : first] / self.span if first > nq or plain else 0.0
-            level = np.maximum(level, FLOOR * below)
-            sizes[first : first + n] = np.maximum(level, FLOOR * self._alike(level))
-        moved = FLOOR * self.span * sizes[nq : nq + n] if plain else 0.0
-        sizes[:nq] = np.maximum(sizes[:nq], np.maximum(moved, FLOOR * FLOOR * sizes[:nq].max()))
+            largest[: len(at.z)] = np.maximum(largest[: len(at.z)], np.abs(at.z).max(axis=1))
+        others = sizes_of(self.model, self.mass, largest, np.ptp(self.run.t) or 1.0)
+        sizes = np.maximum(largest, FLOOR * others)
         return np.where(sizes > 0, sizes, 1.0)
-
-    def _alike(self, level):
-        """For each component of a level of jets, what has as large an energy as the largest of them."""
-        weights = np.sqrt(self.mass)
-        return np.divide((weights * level).max(), weights, out=level.copy(), where=weights > 0)
 
     def _response(self, f, t, x, y, steps):
         """Change of f(t, x, p) = y if each entry of x changes by its step: root mean square over random directions."""
@@ -266,86 +229,75 @@ class _Checks:
 
     # between samples
 
-    def _integrate(self, segments):
-        """The intervals between samples and knots, which edges are samples, and instants inside."""
+    @property
+    def flat(self):
+        """Whether the motion is solved for q at each instant, and not integrated."""
+        return self.model.flat and self.run.method == "algebraic"
+
+    def _edges(self, segments):
+        """The samples, and the knots between them."""
         run, knots = self.run, np.asarray(self.run.knots)
-        if len(run.t) < 2:
-            self.doubts.append("one sample is no motion: simulate with more samples")
-            return None, None, [], None
         ordered = np.sort(run.t)
         after = np.clip(np.searchsorted(ordered, knots), 1, len(ordered) - 1)
         near = np.minimum(np.abs(ordered[after - 1] - knots), np.abs(ordered[after] - knots))
         knots = knots[(near > SAME_TIME * (1 + np.abs(knots))) & (knots > ordered[0]) & (knots < ordered[-1])]
-        edges = np.union1d(run.t, knots)[:: 1 if run.t[-1] > run.t[0] else -1]
-        sampled, self.edges = np.isin(edges, run.t), edges
-        flat = self.model.flat and run.method == "algebraic"
-        n_x = self.model.nq if flat else len(self.model.state_names)
-        x = np.full((n_x, len(edges)), np.nan)
-        x[:, sampled] = run.jets[:n_x]
-        count = len(edges) - 1
-        steps = np.full(count, -(-segments // count))
-        watched = slice(None, None, max(1, count // OWN_INSTANTS))
-        steps[watched] = np.maximum(steps[watched], np.clip(-(-OWN_INSTANTS // count) + 1, 2, MOST_OWN))
-        settings = Integration(self.sizes[:n_x], LIMITS["segments"], steps, np.full(count, np.inf))
-        again = partial(self._between, flat, np.cumsum(sampled) - 1, edges, x, settings)
-        found = again()
-        return found, sampled, self._own(found), again
+        t = np.union1d(run.t, knots)[:: 1 if run.t[-1] > run.t[0] else -1]
+        sampled, n_x = np.isin(t, run.t), self.model.nq if self.flat else len(self.model.state_names)
+        known = np.full((n_x + 1, len(t)), np.nan)
+        gained = np.diff(self.energies, prepend=self.energies[0]) if self.balanced else np.zeros(len(run.t))
+        known[:, sampled] = np.vstack([run.jets[:n_x], gained])
+        of_work = self.energy_size / len(t) * LIMITS["energy"] / LIMITS["segments"]
+        sizes = np.append(self.sizes[:n_x], of_work)
+        steps = max(-(-segments // (len(t) - 1)), 1 + -(-OWN_INSTANTS // (len(t) - 1)))
+        return Edges(t, sampled, known, sizes, LIMITS["segments"], steps)
 
-    def _between(self, flat, sample, edges, x, settings, **changes):
-        return between(self._attempts(flat, sample), edges, x, replace(settings, **changes))
-
-    def _attempts(self, flat, sample):
+    def _attempts(self):
         """The flows to try from edges on: of the variants next to their samples, and of one with its own pivots.
 
         Each attempt is a function of the indices (K,) of edges and returns pairs of a flow and of those that it leads
         on. Edges lie on all switches, so that the model itself is smooth between them.
         """
-        variants = [self.model if self.family else v for *_, v in self.run.variants]
+        variants = [self.model if self.family and not self.flat else v for *_, v in self.run.variants]
         first = np.array([next(i for i, v in enumerate(variants) if v is variant) for variant in variants])  # the same
+        sample = np.cumsum(self.edges.sampled) - 1
         of = np.searchsorted([a for a, *_ in self.run.variants], sample, side="right") - 1
-        allowance = [MOST_OWN_PIVOTS]
 
-        def flow(model, most=FEW_STEPS):
-            return Flow(model, flat, self.balanced, most)
+        def flow(model):
+            return Flow(model, self.flat, self.balanced)
 
-        def next_to(ks, shift=0, most=FEW_STEPS):
+        def next_to(ks, shift=0):
             ks = ks[of[ks] + shift < len(variants)]
             model = first[of[ks] + shift]
-            return [(flow(variants[j], most), ks[model == j]) for j in np.unique(model)]
+            return [(flow(variants[j]), ks[model == j]) for j in np.unique(model)]
 
         def own_sides(ks):  # whose residuals count, in which angles may have turned round
-            return [(flow(self._side_after(self.edges[k : k + 2].mean(), sample[k]), ENOUGH_STEPS), [k]) for k in ks]
+            ks = ks[first[of[ks]] != first[of[np.searchsorted(sample, sample[ks] + 1)]]]
+            t = (self.edges.t[ks] + self.edges.t[ks + 1]) / 2
+            z = np.array([self.run.at(instant) for instant in t]).T
+            return [(flow(model), ks[which]) for model, which in self._sides(self.model, t, z)]
 
         def own_pivots(ks):
             found = []
-            for k in ks[: allowance[0]]:
-                allowance[0] -= 1
+            for k in ks[:MOST_OWN_PIVOTS]:
                 with contextlib.suppress(ServoError):
                     at = self.run.jets[: len(self.model.jet_names), sample[k]]
                     found.append((flow(self.model.near(self.run.t[sample[k]], at)), [k]))
             return found
 
-        sides = [own_sides] if flat and self.family else []
-        return [*sides, next_to, partial(next_to, shift=1), own_pivots, partial(next_to, most=ENOUGH_STEPS)]
+        sides = [own_sides] if self.flat and self.family else []
+        return [*sides, next_to, partial(next_to, shift=1), own_pivots]
 
-    def _side_after(self, t, sample):
-        """The variant of a run with switches at t [s], after a sample."""
-        before, after = (self.run.variant(k) for k in (sample, min(sample + 1, len(self.run.t) - 1)))
-        if before is after:
-            return before
-        x = self.run.at(t)[: len(self.model.state_names)]
-        return self.family.at(self.family.branches(t, x, sides(self.model, before)))
-
-    def _own(self, found):
+    def _own(self):
         """Instants inside the intervals, some OWN_INSTANTS of them, by variant."""
         by_flow = {}
-        for flow, t, z in found.inside:
+        for flow, t, z in self.between.inside:
             by_flow.setdefault(flow, []).append((t, z))
         own = []
         for flow, parts in by_flow.items():
             t, z = (np.concatenate(values, axis=-1) for values in zip(*parts, strict=True))
             few = np.unique(np.linspace(0, len(t) - 1, OWN_INSTANTS).astype(int))
-            t, z = t[few], flow.corrected(t[few], z[:, few])
+            t, z = t[few], z[:, few]
+            z = flow.values(t, flow.settled(t, z[: self.model.nq]))[1] if self.flat else z
             regular = _regular(flow.model, t, z)
             t, z = (t[regular], z[:, regular]) if regular.any() else (t, z)
             for model, which in self._sides(flow.model, t, z):
@@ -368,16 +320,22 @@ class _Checks:
 
     def segments(self):
         """Largest difference of the states from those integrated from the sample before."""
-        found = self.between
-        unknown = np.flatnonzero(~found.resolved)
+        resolved = self.between.resolved
+        unknown = np.flatnonzero(~resolved)
         if len(unknown):
-            first = self.run.t[np.cumsum(self.sampled)[unknown[0]] - 1]
-            where = f"{len(unknown)} of {len(found.resolved)} intervals between samples, the first from {first:.6g} s"
+            first = self.run.t[np.cumsum(self.edges.sampled)[unknown[0]] - 1]
+            where = f"{len(unknown)} of {len(resolved)} intervals between samples, the first from {first:.6g} s"
             what = "the motion is too fast to follow, or singular: simulate with more samples (t_eval)"
             self.doubts.append(f"in {where} on, {what}")
-        known = np.flatnonzero(found.resolved & self.sampled[1:])
-        targets = self.run.jets[: len(found.ends), np.cumsum(self.sampled)[known]]
-        return largest((found.ends[:, known] - targets) / self.sizes[: len(found.ends), None])
+        return largest((self._off()[:-1] / self.sizes[: len(self.edges.known) - 1, None])[:, self._known()])
+
+    def _known(self):
+        """Which samples after the first were reached."""
+        return self.between.resolved[self.edges.sampled[1:]]
+
+    def _off(self):
+        """States reached at the samples after the first, and the work done, less what is known of them."""
+        return (self.between.ends - self.edges.known[:, 1:])[:, self.edges.sampled[1:]]
 
     # the equations
 
@@ -404,29 +362,20 @@ class _Checks:
         worst = {f"residual {name}": 0.0 for name in self.run.residual}
         for at in self.instants:
             f = at.model.signals("residuals")[1]
-
-            def values(t, z, f=f, model=at.model):
-                return f.grid(t, z, model.parameters)
-
-            levels = values(at.t, at.z[: f.n_x])
-            known = levels if at.first is None else self._as_stored(np.abs(levels), names, at.first)
+            levels, few = at.signals("residuals"), at.few
             sizes = self._response(
-                values, at.t[at.few], at.z[: f.n_x, at.few], levels[:, at.few], self.sizes[: f.n_x, None]
+                lambda t, z, f=f, p=at.model.parameters: f.grid(t, z, p),
+                at.t[few],
+                at.z[: f.n_x, few],
+                levels[:, few],
+                self.sizes[: f.n_x, None],
             )
-            for (name, _), level, size in zip(names, known, np.median(sizes, axis=1, keepdims=True), strict=True):
+            for (name, _), level, size in zip(names, levels, np.median(sizes, axis=1, keepdims=True), strict=True):
                 worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
         for name in self.model.reduction.mechanism.reported:  # of a program that inputs realise approximately
             del worst[f"residual {name}"]
             self.notes.append(f"the program's residual {name} is at most {largest(self.fresh.residual[name]):.2g}")
         return worst
-
-    def _as_stored(self, levels, names, first):
-        """Levels, or those that the run has stored if these are larger."""
-        for i, (name, level) in enumerate(names):
-            stored = numbers(self.run.stored_residual.get(name), 2)
-            if stored is not None and len(stored) > level and stored.shape[1] >= first + levels.shape[1]:
-                levels[i] = np.fmax(levels[i], np.abs(stored[level, first : first + levels.shape[1]]))
-        return levels
 
     def signals(self):
         """Largest difference of a stored signal from its value at the samples, relative to its largest value."""
@@ -450,67 +399,20 @@ class _Checks:
         if not self.balanced:
             self.notes.append("energy: not applicable, the inertia terms depend on time or on more than wᵀMw/2")
             return {}
-        if self.between is None or not self.between.resolved.all():
+        if len(self.run.t) < 2 or not self.between.resolved.all():
             return {}
-        energy = np.concatenate([at.signals("energy") for at in self.samples], axis=1)[0]
-        kinetic = (self.mass * self.sizes[self.model.nq : self.model.nq + self.model.n] ** 2).max() / 2
-        scale = max(kinetic, np.ptp(energy), *np.abs(np.cumsum(self.between.work)))
-        scale += ROUNDING / LIMITS["energy"] * self.powers[4].max()
-        work = self._work(np.diff(energy), AGREES * LIMITS["energy"] * scale)
-        if not np.isfinite(work).all():
-            where = f"after t = {self.run.t[int(np.argmin(np.isfinite(work)))]:.6g} s"
-            self.doubts.append(
-                f"peaks of power {where} are too narrow to integrate: simulate with more samples (t_eval)"
-            )
-            return {}
-        return {"energy": largest((energy - energy[0] - np.append(0.0, np.cumsum(work))) / scale)}
-
-    def _work(self, gained, allowed):
-        """Work between samples (N - 1,), by shorter steps where it is not the energy gained; NaN where it is not known.
-
-        `allowed` is an error of the sum.
-        """
-        work = self._known_work(self.between.work)
-        doubtful = np.abs(work - gained) > allowed / len(gained)
-        if self._off(gained) <= allowed or not doubtful.any():
-            return work
-        whose = self._sample_before()
-        found = self.integrated(work=np.where(doubtful, allowed / doubtful.sum(), np.inf)[whose])
-        return self._known_work(np.where(found.resolved, found.work, np.nan))
-
-    def _sample_before(self):
-        """The index of the sample at or before each edge but the last."""
-        return np.cumsum(self.sampled)[:-1] - 1
-
-    def _known_work(self, work):
-        """Work between samples (N - 1,) from that between edges."""
-        return np.bincount(self._sample_before(), work, len(self.run.t) - 1)
-
-    def _off(self, gained):
-        """Largest difference of the work since the start from the energy gained."""
-        return np.abs(np.cumsum(self._known_work(self.between.work) - gained)).max()
+        return {"energy": largest(np.cumsum(self._off()[-1]) / self.energy_size)}
 
     # further signals
 
     def higher_jets(self):
         """Largest error of the jets above the order of the model."""
-        n, nq, top = self.model.n, self.model.nq, self.model.reduction.top
-        last, worst = (len(self.run.jets) - nq) // n, 0.0
-        if last <= top:
+        n_z, worst = len(self.model.jet_names), 0.0
+        if len(self.run.jets) <= n_z:
             return {}
         for at in self.samples:
-            f, p = series_loop(at.model, last), np.tile(at.model.parameters[:, None], len(at.t))
-
-            def jets(t, x, f=f, p=p, plain=at.model.reduction.mechanism.q.plain):
-                y = f.grid(t, x, np.vstack([p, t]))[0 if plain else nq * last :]
-                factorials = [factorial(k) for k in range(top + 1, last + 1)]
-                return y[top * n : last * n] * np.repeat(np.array(factorials, dtype=float), n)[:, None]
-
-            x = at.z[: len(self.model.state_names)]
-            again = jets(at.t, x)
-            rounding = self._response(jets, at.t, x, again, np.abs(x))
-            sizes = self.sizes[nq + top * n :, None] + ROUNDING / self.limit("higher jets") * rounding
-            worst = max(worst, largest((at.z[nq + top * n :] - again) / sizes))
+            again = at.model.extended(at.t, at.z[:n_z], len(at.z))
+            worst = max(worst, largest((at.z - again) / self.sizes[:, None]))
         return {"higher jets": worst}
 
     def switches(self):
@@ -533,7 +435,6 @@ class _Checks:
             values = at.signals("reach")
             size = max(size, np.abs(values[:n]).max())
             reaction, E = values[:n].T[:, :, None], values[n:].reshape(-1, n, len(at.t)).transpose(2, 1, 0)
-            E = E[:1] if np.all(E == E[:1]) else E
             inverse = np.linalg.pinv(E, rcond=max(E.shape[1:]) * np.finfo(float).eps)
             worst = max(worst, largest(reaction - E @ (inverse @ reaction)))
         return {"outside": worst / size}
