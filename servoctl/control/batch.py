@@ -107,9 +107,8 @@ def _signals(plant, residuals, t, x, p):
     """Residuals of the state x at t."""
     if not residuals:
         return ca.SX(0, 1)
-    places = [plant.mechanism.parameters.names.index(name) for name in residuals.parameter_names]
     # a single parameter indexed by [] is a row in CasADi, not a column
-    numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in places))
+    numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in residuals.places))
     return residuals.expression(t, x, plant.state_names, numbers)
 
 

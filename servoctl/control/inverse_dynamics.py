@@ -15,7 +15,7 @@ import numpy as np
 from servoctl.checks import as_complex, by_name, is_number, positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
-from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plan
+from servoctl.control.reference import Reference, of_plan, refuse_transport
 from servoctl.control.residuals import in_symbols_of
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics
@@ -389,9 +389,8 @@ def computed(
     NotRealisable
         If a residual depends on no input.
     """
-    rate = positive("rate", rate)
     plant = of_plan(plan, plant)
-    require_plan(plan, plant)
+    reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
     _require_stable(plan)
@@ -399,23 +398,22 @@ def computed(
     _require_smooth(plan, linear.orders)
     poles = _poles(poles, linear.orders)
     for name, values in poles.items():
-        _require_slow(name, values, rate, delay)
+        _require_slow(name, values, reference.rate, delay)
     coefficients = [np.poly(values).real[:0:-1] for values in poles.values() if len(values)]
-    ahead = Reference(plan, plant, rate).ahead(delay)
-    columns = ([plant.parameters, [1.0 / rate], u, *coefficients] for u in ahead.T)
+    columns = ([plant.parameters, [reference.period], u, *coefficients] for u in reference.ahead(delay).T)
     info = {"orders": linear.orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {order}" for name, order in linear.orders.items())
     return Law(
         name="computed",
         measures=plant.state_names,
         inputs=plant.inputs,
-        rate=rate,
+        rate=reference.rate,
         t0=float(plan.t[0]),
         step=linear.step,
         schedule=np.column_stack([np.concatenate(column) for column in columns]),
         state=linear.start,
         state_names=linear.state_names,
-        initial_input=np.array([plan[name][0] for name in plant.inputs]),
+        initial_input=reference.initial_input,
         plan=plan,
         info=info,
     )
@@ -429,20 +427,16 @@ def _require_smooth(plan, orders):
 
 
 def _require_stable(plan):
+    """Refuse a plan whose internal dynamics are not known to be stable."""
     internal = internal_dynamics(plan)
     if internal.verdict not in ("unstable", "inconclusive"):
         return
     worst, names = float(internal.eigenvalues.real.max(initial=-np.inf)), ", ".join(internal.names)
     facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
-    if internal.verdict == "inconclusive":
-        raise UnstableInternalDynamics(
-            f"The internal dynamics of {names} are inconclusive: {internal.cause}.",
-            "Exact linearisation makes them unobservable and does not stabilise them.",
-            do="Remove this cause, or use sv.lqr.",
-            **facts,
-        )
     raise UnstableInternalDynamics(
-        f"The internal dynamics of {names} are unstable: along the plan errors grow by {internal.growth:.3g} in "
+        f"The internal dynamics of {names} are inconclusive: {internal.cause}."
+        if internal.verdict == "inconclusive"
+        else f"The internal dynamics of {names} are unstable: along the plan errors grow by {internal.growth:.3g} in "
         f"{internal.length:.3g} s (frozen eigenvalues up to {worst:.6g} 1/s).",
         "Exact linearisation makes them unobservable and does not stabilise them.",
         do="Use sv.lqr, which stabilises the whole state about the plan, or choose another output.",

@@ -14,8 +14,8 @@ from servoctl.checks import ON_SAMPLE, as_list, finite, interval, mapping, named
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.matrices import riccati
+from servoctl.control import conditions
 from servoctl.control.close import require_names
-from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, of_plan, require_plant
@@ -172,13 +172,13 @@ def limited(
     H = _metric(reference, residuals, _weights(residuals, weights, priority), at_once)
     sizes = _sizes(law.plan, plant, H)
     allocation = Allocation(law, plant, effects, bounds, residuals, sizes, np.abs(D).max(axis=0) @ sizes)
-    low, high, change = ranges(plant, law.period)
+    low, high, change = conditions.limits(plant, law.period)
     numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])
     return replace(
         law,
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
         step=allocation,
-        schedule=_schedule(law, reference, D, H, _finite(numbers)),
+        schedule=_schedule(law, reference, D, H, np.clip(numbers, -OPEN, OPEN)),
         state=np.concatenate([law.state, np.clip(law.initial_input, low, high)]),
         state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
         signals=(*law.signals, *allocation.signals),
@@ -233,11 +233,6 @@ def _schedule(law, reference, D, H, numbers):
     parts = (law.schedule, numbers[:, None], *matrix, along)
     samples = np.arange(max(count, law.schedule.shape[1]))
     return np.vstack([part[:, np.minimum(samples, part.shape[1] - 1)] for part in parts])
-
-
-def _finite(numbers):
-    """Numbers within the range of a schedule."""
-    return np.clip(numbers, -OPEN, OPEN)
 
 
 def _require_law(law, plant):
@@ -301,7 +296,7 @@ def _metric(reference, names, weights, at_once):
     w = Q_POSITION * np.array([weights[names.index(name)] for name in residuals.names])
     Q = np.einsum("nki,k,nkj->nij", C, w, C) + UNSEEN * Q_POSITION * np.eye(plant.n_x)
     R, basis = R_INPUT * np.eye(len(plant.inputs)), tangents(reference)
-    _, P = steady(A[-1:], B[-1:], Q[-1], R, None if basis is None else basis[-1:])
+    _, P = steady(A[-1:], B[-1:], Q[-1], R, basis[-1:])
     H = riccati(A[::-1], B[::-1], Q[::-1], R, P)[1][::-1]
     for name, O in at_once.items():
         H += Q_POSITION * weights[names.index(name)] * np.einsum("ni,nj->nij", O, O)
@@ -342,10 +337,11 @@ class Allocation(Value):
     def _layouts(self):
         """Layouts of the arguments x and column, and of the law's output."""
         law, m, k, n_z = self.law, len(self.sizes), len(self.residuals), len(self.law.state)
-        for_c = 4 * m + self.bounds.size + len(self.plant.parameters) + (n_z * m if law.input_matrix is not None else 0)
+        for_c = m + self.bounds.size + len(self.plant.parameters) + (n_z * m if law.input_matrix is not None else 0)
+        limits, along = {"low": m, "high": m, "change": m}, {"x_ref": self.plant.n_x, "D": (k, m), "H": (m, m)}
         return (
             Layout(y=len(law.measures), z=n_z, last=m),
-            Layout(column=law.schedule.shape[0], for_c=for_c, x_ref=self.plant.n_x, D=(k, m), H=(m, m)),
+            Layout(column=law.schedule.shape[0], **limits, for_c=for_c, **along),
             Layout(u=m, z=n_z, signals=len(law.signals)),
         )
 
@@ -353,11 +349,6 @@ class Allocation(Value):
     def measured(self):
         """Indices of the measured states."""
         return [self.plant.state_names.index(name) for name in self.law.measures]
-
-    @cached_property
-    def _limits(self):
-        """Lower and upper limits, and the largest change in a sample, (m,) each."""
-        return ranges(self.plant, self.law.period)
 
     @cached_property
     def _qp(self):
@@ -412,8 +403,8 @@ class Allocation(Value):
         desired = of_output.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
         state = along.x_ref.copy()
         state[self.measured] = now.y
-        low, high, change = self._limits
-        low, high = np.maximum(low, now.last - change), np.minimum(high, now.last + change)
+        low = np.maximum(along.low, now.last - along.change)
+        high = np.minimum(along.high, now.last + along.change)
         c, O = self.effects(t, state)
         u = self._allocate(t, desired.u, low, high, along.H, c, O)
         difference = u - desired.u
@@ -494,7 +485,7 @@ def _weights(names, weights, priority):
 
 def _sizes(plan, plant, H):
     """A typical size of each input, (m,): the width of its limits, else its largest value in the plan."""
-    low, high, _ = ranges(plant, 1.0)
+    low, high, _ = conditions.limits(plant, 1.0)
     used = np.array([np.abs(plan[name]).max() for name in plant.inputs])
     sizes = np.where(np.isfinite(high - low), high - low, used)
     unit = 1 / np.sqrt(np.diagonal(H, axis1=1, axis2=2).max(axis=0))  # inputs of equal cost

@@ -94,9 +94,9 @@ class Reference:
         A, B = self.plant.linearised(self.middle, self.middle_x, self.middle_input)
         lost = _lost(A, B)
         if lost.any() and self.plant.constrained:
-            k, at = int(np.argmax(lost)), (self.middle, self.middle_x, self.middle_input)
+            k = int(np.argmax(lost))
             other = self.plant.near(float(self.middle[k]), self.middle_x[:, k])
-            A[lost], B[lost] = other.linearised(at[0][lost], at[1][:, lost], at[2][:, lost])
+            A[lost], B[lost] = other.linearised(self.middle[lost], self.middle_x[:, lost], self.middle_input[:, lost])
             lost = _lost(A, B)
         if lost.any():
             raise ServoError(

@@ -33,10 +33,12 @@ class PlantEquations:
     `others` are the same equations with pivots that were decided near states where these vanish.
     """
 
-    def __init__(self, mechanism, forces, damped, lagged, values=None):
+    def __init__(self, mechanism, forces, damped, lagged, values=None, context=None):
         q = self.q = mechanism.q
         self.mechanism, self.choices, self.lagged = mechanism, (forces, damped, lagged, values), lagged
         self.values = mechanism.parameters.values() if values is None else np.array(values)
+        parameters = mechanism.parameters.symbols
+        self._context = Context(parameters, self.values, WINDOW, {}) if context is None else context
         self.functions, self.others = {}, []
         self.forces = _expression(forces, mechanism)
         self.velocity = ca.vertcat(*q.gamma(1))
@@ -66,19 +68,12 @@ class PlantEquations:
         require_inertia(m, rows, points)
         return rows, points
 
-    @cached_property
-    def _context(self):
-        """Where orders and pivots are decided."""
-        return Context(self.mechanism.parameters.symbols, self.values, WINDOW, {})
-
     def near(self, t, x, values):
         """The same equations with orders and pivots decided near a state x (n_x,) at t [s], with these parameters."""
-        forces, damped, lagged, _ = self.choices
-        again = PlantEquations(self.mechanism, forces, damped, lagged, tuple(values))
         state = dict(zip((*self.q.names, *self.q.jet_names(1)), map(float, x), strict=False))
-        window = t - NEARBY, t + NEARBY
-        again._context = Context(self.mechanism.parameters.symbols, again.values, window, state, NEAR_SPREAD)
-        return again
+        parameters, window = self.mechanism.parameters.symbols, (t - NEARBY, t + NEARBY)
+        context = Context(parameters, np.array(values), window, state, NEAR_SPREAD)
+        return PlantEquations(self.mechanism, *self.choices[:-1], tuple(values), context)
 
     def require_inertia(self, values):
         """Raise SpecificationError if the mass matrix is not positive with parameters (n_p,) or (n_p, N)."""
