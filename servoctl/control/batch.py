@@ -28,7 +28,7 @@ class Unit:
     """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
     `table` maps t_k and row k of the schedule to values that are common to all cases at a sample. `states`, `inputs`
-    and `residuals` (Residuals or None) are gathered; `n_y` is the number of measurements.
+    and `residuals` (Residuals or None) are gathered.
     """
 
     text: str
@@ -36,7 +36,6 @@ class Unit:
     states: tuple
     inputs: tuple
     residuals: object
-    n_y: int
 
     @property
     def names(self):
@@ -100,7 +99,7 @@ def _derived(plant, law, disturbed, residuals):
     ]
     table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
     table = compiled(table, "table")
-    return Unit("".join(parts), table, plant.state_names, plant.inputs, residuals, len(law.measures))
+    return Unit("".join(parts), table, plant.state_names, plant.inputs, residuals)
 
 
 def _signals(plant, residuals, t, x, p):

@@ -88,17 +88,8 @@ def close(
     if plan is not None:
         require_plan(plan, plant)
     plan = law.plan if plan is None else plan
-    plant = regular_at_start(plant, t_span[0], x0)
-    return finished(plant, law, plan, loop_of(plant, law, x0, t_span, conditions), conditions)
-
-
-def regular_at_start(plant, t0, x0):
-    """The plant, with pivots decided near the start of a loop if those decided elsewhere vanish there."""
-    if not plant.constrained:
-        return plant
-    rest = np.zeros(len(plant.inputs))
-    x = _initial_state(plant, t0, x0, rest)
-    return plant if np.isfinite(plant.rates(t0, x, rest)).all() else plant.near(t0, x)
+    plant, loop = loop_of(plant, law, x0, t_span, conditions)
+    return finished(plant, law, plan, loop, conditions)
 
 
 def _of_start(plant, plan, x0):
@@ -111,7 +102,7 @@ def _of_start(plant, plan, x0):
 
 
 def loop_of(plant, law, x0, t_span, conditions):
-    """All numbers of the loop, in tables made beforehand."""
+    """The plant, with pivots that do not vanish at the start, and all numbers of the loop, in tables."""
     (t0, t1), sensors, timing, forces = t_span, conditions.sensors, conditions.timing, conditions.disturbance
     samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     stored = plant.n_x + len(law.measures) + len(law.state) + law.n_out + len(plant.inputs) + len(sensors.noise)
@@ -121,9 +112,11 @@ def loop_of(plant, law, x0, t_span, conditions):
     low, high, change = limits(plant, law.period)
     initial = np.clip(_initial_input(law, t0), low, high)
     x0 = _initial_state(plant, t0, x0, initial)
+    if plant.constrained and not np.isfinite(plant.rates(t0, x0, initial)).all():
+        plant = plant.near(t0, x0)
     substeps, transport = steps(plant, law.period, timing.substeps, t0, x0, initial)
     require_few_steps(samples, substeps, plant.function("ode").operations)
-    return Loop(
+    loop = Loop(
         samples=samples,
         substeps=substeps,
         delay=timing.delay,
@@ -148,6 +141,7 @@ def loop_of(plant, law, x0, t_span, conditions):
         transport=transport,
         **conditions.forces(t0, law.period / substeps, samples * substeps),
     )
+    return plant, loop
 
 
 def _initial_input(law, t0):
@@ -164,8 +158,7 @@ def _initial_state(plant, t0, x0, initial_input):
     x = plant.state(x0)
     for i, name in enumerate(plant.lagged, len(x) - len(plant.lag)):
         x[i] = initial_input[plant.inputs.index(name)] if np.isnan(x[i]) else x[i]
-    if plant.constrained:
-        require_consistent(plant, t0, x[:, None], plant.p()[:, None])
+    require_consistent(plant, t0, x[:, None], plant.p()[:, None])
     return x
 
 
@@ -194,9 +187,7 @@ def finished(plant, law, plan, loop, conditions, advance=None):
     status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop, advance)
     if status == INTERRUPTED and not len(x):
         raise KeyboardInterrupt
-    t = np.arange(len(x), dtype=float)
-    t *= loop.period
-    t += loop.t0
+    t = loop.t0 + np.arange(len(x)) * loop.period
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.state)
     end = loop.t0 + len(x) * loop.period
     message = {

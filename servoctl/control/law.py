@@ -222,26 +222,14 @@ class Law(Value, Shown):
         SpecificationError
             If t is between samples, before the first, or not finite.
         """
-        t = finite("t", t, "time")
-        k = (t - self.t0) * self.rate
-        if abs(k - round(k)) > ON_SAMPLE or round(k) < 0:
-            nearest = self.t0 + max(round(k), 0) / self.rate
-            raise SpecificationError(
-                f"t = {t:.9g} s is not a sampling instant of the law {self.name!r}.",
-                f"Its samples are at {self.rate:g} Hz from t = {self.t0:g} s on.",
-                nearest=f"t = {nearest:.9g} s.",
-                do="Call it at a sampling instant.",
-                name=self.name,
-                t=t,
-                nearest_t=nearest,
-                rate=self.rate,
-            )
-        return self.schedule[:, min(round(k), self.schedule.shape[1] - 1)]
+        k = sample_at(t, self.t0, self.period, np.inf, f"the law {self.name!r}")
+        return self.schedule[:, min(k, self.schedule.shape[1] - 1)]
 
     def __repr__(self):
         shown = {name: value for name, value in self.info.items() if isinstance(value, (str, int, float))}
+        end = self.t0 + (self.schedule.shape[1] - 1) / self.rate
         lines = [
-            f"Law: {self.name}, {self.rate:g} Hz, t = {self.t0:g} .. {self._end:g} s, then held",
+            f"Law: {self.name}, {self.rate:g} Hz, t = {self.t0:g} .. {end:g} s, then held",
             f"  measures {', '.join(self.measures) or '(nothing)'}"[:118],
             f"  commands {', '.join(self.inputs)}"[:118],
         ]
@@ -249,10 +237,6 @@ class Law(Value, Shown):
             lines.append(f"  controller state: {', '.join(self.state_names)}"[:118])
         lines += [f"  {name}: {v:.4g}" if isinstance(v, float) else f"  {name}: {v}"[:118] for name, v in shown.items()]
         return "\n".join(lines[:12])
-
-    @property
-    def _end(self):
-        return self.t0 + (self.schedule.shape[1] - 1) / self.rate
 
 
 class Controller:
@@ -329,6 +313,25 @@ class UserStep:
         """The inputs, (m,), of the measured states x, (n_y,), at t [s]."""
         u = self.function(t, dict(zip(self.states, x.tolist(), strict=True)))
         return ordered(u, self.inputs, f"output of the law {self.name!r} at t = {t:.6g} s")
+
+
+def sample_at(t, t0, period, last, whose):
+    """The index of the sample at t [s], up to the last; `whose` samples they are goes into the message."""
+    t = finite("t", t, "time")
+    k = min(max(round((t - t0) / period), 0), last)
+    nearest = t0 + k * period
+    if abs(t - nearest) > ON_SAMPLE * period:
+        raise SpecificationError(
+            f"t = {t:.9g} s is not a sampling instant of {whose}.",
+            f"Its samples are {period:g} s apart, from t = {t0:g} s "
+            + (f"to {t0 + last * period:g} s." if last < np.inf else "on."),
+            nearest=f"t = {nearest:.9g} s.",
+            do="Pass a sampling instant.",
+            t=t,
+            nearest_t=nearest,
+            period=period,
+        )
+    return k
 
 
 def ordered(values, names, what, exactly=True):

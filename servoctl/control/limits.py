@@ -168,10 +168,10 @@ def limited(
     _require_law(law, plant)
     effects, bounds = _bounds(plant, bounds)
     reference = Reference(law.plan, plant, law.rate)
-    residuals, D, at_once = _predicted(reference, positive("horizon", horizon))
-    H = _metric(reference, residuals, _weights(residuals, weights, priority), at_once)
+    weights = _weights(tuple(program_residuals(law.plan.model)), weights, priority)
+    D, H = _predicted(reference, positive("horizon", horizon), weights)
     sizes = _sizes(law.plan, plant, H)
-    allocation = Allocation(law, plant, effects, bounds, residuals, sizes, np.abs(D).max(axis=0) @ sizes)
+    allocation = Allocation(law, plant, effects, bounds, tuple(weights), sizes, np.abs(D).max(axis=0) @ sizes)
     low, high, change = conditions.limits(plant, law.period)
     numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])
     return replace(
@@ -263,14 +263,31 @@ def _require_law(law, plant):
         )
 
 
-def _predicted(reference, horizon):
-    """Names of residuals, their deviation after the horizon per unit of input (N, k, m), immediate effects by name."""
+def _predicted(reference, horizon, weights):
+    """Deviations D of residuals after the horizon per unit of input, (N, k, m), and costs H of the inputs, (N, m, m).
+
+    `weights` w_i by residual; H = R + BᵀPB along the plan, with P the cost-to-go of Σ w_i φ_i².
+    """
+    plant, residuals = reference.plant, Residuals(reference.plan.model, reference.plant)
+    (A, B), C = reference.linearised(), residuals.jacobian(reference.t, reference.x)
+    D = dict(zip(residuals.names, np.moveaxis(C @ discretised(A, B, horizon)[1], 1, 0), strict=True))
+    A, B = discretised(A, B, reference.period)
+    w = Q_POSITION * np.array([weights[name] for name in residuals.names])
+    Q = np.einsum("nki,k,nkj->nij", C, w, C) + UNSEEN * Q_POSITION * np.eye(plant.n_x)
+    R, basis = R_INPUT * np.eye(len(plant.inputs)), tangents(reference)
+    _, P = steady(A[-1:], B[-1:], Q[-1], R, basis[-1:])
+    H = riccati(A[::-1], B[::-1], Q[::-1], R, P)[1][::-1]
+    for name, O in _at_once(reference, residuals.names).items():
+        D[name] = O
+        H += Q_POSITION * weights[name] * np.einsum("ni,nj->nij", O, O)
+    return np.stack([D[name] for name in weights], axis=1), H
+
+
+def _at_once(reference, others):
+    """Immediate effects of the inputs on residuals of order 2 along the plan, (N, m) by name; not of `others`."""
     plan, plant = reference.plan, reference.plant
     program, q = program_residuals(plan.model), plan.model.reduction.mechanism.q
-    residuals = Residuals(plan.model, plant)
-    _, B = discretised(*reference.linearised(), horizon)
-    D = dict(zip(residuals.names, np.moveaxis(residuals.jacobian(reference.t, reference.x) @ B, 1, 0), strict=True))
-    second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in D}
+    second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in others}
     for name in second:
         if (order := q.order(program[name])) > 2:
             raise SpecificationError(
@@ -282,25 +299,7 @@ def _predicted(reference, horizon):
             )
     effects = Effects(plant, second)
     slopes = np.array([effects(t, x)[1] for t, x in zip(reference.t, reference.x.T, strict=True)])
-    at_once = {name: slopes[:, i] for i, name in enumerate(second)}
-    names = tuple(program)
-    return names, np.stack([(D | at_once)[name] for name in names], axis=1), at_once
-
-
-def _metric(reference, names, weights, at_once):
-    """R + BᵀPB along the plan, P the cost-to-go of Σ w_i φ_i², (N, m, m)."""
-    plant = reference.plant
-    residuals = Residuals(reference.plan.model, plant)
-    A, B = discretised(*reference.linearised(), reference.period)
-    C = residuals.jacobian(reference.t, reference.x)
-    w = Q_POSITION * np.array([weights[names.index(name)] for name in residuals.names])
-    Q = np.einsum("nki,k,nkj->nij", C, w, C) + UNSEEN * Q_POSITION * np.eye(plant.n_x)
-    R, basis = R_INPUT * np.eye(len(plant.inputs)), tangents(reference)
-    _, P = steady(A[-1:], B[-1:], Q[-1], R, basis[-1:])
-    H = riccati(A[::-1], B[::-1], Q[::-1], R, P)[1][::-1]
-    for name, O in at_once.items():
-        H += Q_POSITION * weights[names.index(name)] * np.einsum("ni,nj->nij", O, O)
-    return H
+    return {name: slopes[:, i] for i, name in enumerate(second)}
 
 
 @frozen(eq=False)
@@ -457,11 +456,11 @@ class Allocation(Value):
 
 
 def _weights(names, weights, priority):
-    """The residuals' weights, (k,)."""
+    """The residuals' weights by name."""
     weights = numbers_by_name(weights, names, "residual", "weight", positive=True)
     order = [] if priority is None else as_list(priority)
     if order == []:
-        return np.array([weights.get(name, 1.0) for name in names])
+        return {name: weights.get(name, 1.0) for name in names}
     if order is None or not all(isinstance(name, str) for name in order) or len({*order}) < len(order):
         raise SpecificationError(
             f"The priority is {repr(priority)[:150]}.",
@@ -480,7 +479,7 @@ def _weights(names, weights, priority):
     for name in order:
         named(name, names, "residual")
     order += [name for name in names if name not in order]
-    return np.array([FALLING ** order.index(name) for name in names])
+    return {name: FALLING ** order.index(name) for name in names}
 
 
 def _sizes(plan, plant, H):

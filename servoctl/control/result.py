@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite
+from servoctl.checks import ON_SAMPLE
 from servoctl.control.conditions import Conditions
-from servoctl.control.law import Law, UserStep
+from servoctl.control.law import Law, UserStep, sample_at
 from servoctl.control.loop import Loop, samples_ago
 from servoctl.control.reference import resampled
 from servoctl.control.residuals import known_residuals
@@ -233,18 +233,7 @@ class Closed(Sampled, Value):
         SpecificationError
             If t is between samples, or outside the run.
         """
-        t = finite("t", t, "time")
-        k = int(np.argmin(np.abs(self.t - t)))
-        if abs(self.t[k] - t) > ON_SAMPLE * self.loop.period:
-            raise SpecificationError(
-                f"t = {t:.9g} s is not a sample of the run.",
-                f"Its samples are {self.loop.period:g} s apart, from {self.t[0]:g} to {self.t[-1]:g} s.",
-                nearest=f"t = {self.t[k]:.9g} s.",
-                do="Pass a sampling instant, as of `run.t`.",
-                t=t,
-                nearest_t=float(self.t[k]),
-            )
-        return self.states[:, k].copy()
+        return self.states[:, sample_at(t, self.loop.t0, self.loop.period, len(self.t) - 1, "the run")].copy()
 
     @property
     def _counters(self):
