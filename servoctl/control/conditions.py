@@ -13,6 +13,7 @@ from servoctl.checks import (
     named,
     numbers_by_name,
     positive,
+    require_kind,
     require_memory,
     texts,
     whole,
@@ -149,15 +150,7 @@ class Conditions:
     def __post_init__(self):
         for name, kind in (("sensors", Sensors), ("timing", Timing)):
             value = kind() if getattr(self, name) is None else getattr(self, name)
-            if not isinstance(value, kind):
-                raise SpecificationError(
-                    f"{name} is {value!r}."[:200],
-                    f"It is a value of sv.{kind.__name__}.",
-                    do=f"Write {name}=sv.{kind.__name__}(...).",
-                    name=name,
-                    kind=type(value).__name__,
-                )
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, require_kind(kind, name, value, f"sv.{kind.__name__}(...)"))
         object.__setattr__(self, "disturbance", dict(mapping(self.disturbance, "The disturbances")))
 
     def forces(self, t0, h, count, finer=1):

@@ -92,7 +92,7 @@ def lqr(
     plant = of_plan(plan, plant)
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
-    Q = weights(Q, _state_weights(plant), plant.state_names, "state", "Q")
+    Q = weights(Q, by_level(plant, Q_POSITION, Q_VELOCITY), plant.state_names, "state", "Q")
     R = weights(R, np.full(len(plant.inputs), R_INPUT), plant.inputs, "actuator", "R", positive=True)
     residuals, Q_i = _integrals(integral, plan, plant)
     A, B = discretised(*reference.linearised(), reference.period)
@@ -119,10 +119,10 @@ def _radii(plant, K, basis):
     return {LARGEST_RADIUS: float(radii.max()), LAST_RADIUS: float(radii[-1])}
 
 
-def _state_weights(plant):
-    """The default diagonal of Q: coordinates, velocities, and 0 for lagged inputs."""
+def by_level(plant, of_coordinates, of_velocities):
+    """A diagonal for the states: a number for coordinates, one for velocities, and 0 for lagged inputs."""
     q, diagonal = plant.mechanism.q, np.zeros(plant.n_x)
-    diagonal[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
+    diagonal[: q.nq + q.n] = [of_coordinates] * q.nq + [of_velocities] * q.n
     return diagonal
 
 

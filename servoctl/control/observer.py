@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import numbers_by_name
 from servoctl.codegen.matrices import riccati
-from servoctl.control.feedback import integral_names, integration, law_step
+from servoctl.control.feedback import integral_names, integrating, integration, law_step
 from servoctl.control.law import Law
-from servoctl.control.lqr import reduced, tangents, weights
+from servoctl.control.lqr import by_level, reduced, tangents, weights
 from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plant
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
@@ -39,13 +39,10 @@ def estimating_law(states, where, n_u, residuals=None):
     K, K_i, L, A, B = (matrix.T for matrix in symbols.values())
     corrected = estimate + L @ (y - x_ref[where] - estimate[where])
     du = -K @ corrected - K_i @ z
-    column = [u_ff, x_ref, *map(ca.vec, symbols.values())]
-    outputs = [u_ff + du, A @ corrected + B @ du]
-    if n_z:
-        period, p = ca.SX.sym("Ts"), ca.SX.sym("p", residuals.parameters.size)
-        column += [period, p]
-        outputs.append(z + period * residuals.expression(t, x_ref + corrected, states, p))
-    return law_step("estimating", t, ca.vertcat(y, estimate, z), ca.vertcat(*column), outputs)
+    further, z_next = integrating(residuals, t, x_ref + corrected, states, z)
+    column = ca.vertcat(u_ff, x_ref, *map(ca.vec, symbols.values()), *further)
+    outputs = [u_ff + du, A @ corrected + B @ du, *z_next]
+    return law_step("estimating", t, ca.vertcat(y, estimate, z), column, outputs)
 
 
 def output_feedback(
@@ -95,7 +92,8 @@ def output_feedback(
     after = basis[np.minimum(np.arange(len(basis)) + 1, len(basis) - 1)]  # at the next sample
     A, B = (after @ (after.swapaxes(1, 2) @ X) for X in discretised(*reference.linearised(), reference.period))
     n_x, n_z = plant.n_x, len(gains.residuals)
-    W = weights(process, _process_noise(plant), plant.state_names, "state", "process") * reference.period
+    intensity = by_level(plant, POSITION_NOISE**2, VELOCITY_NOISE**2)
+    W = weights(process, intensity, plant.state_names, "state", "process") * reference.period
     where = [plant.state_names.index(name) for name in measured]
     C = np.eye(n_x)[where]
     L = _filter(A, C, W, np.diag(deviations**2), basis, after)
@@ -127,15 +125,6 @@ def _info(law, A, LC, basis):
     """The results of a law's design, and the largest spectral radius of the filter's errors."""
     errors = reduced(A @ (np.eye(A.shape[1]) - LC), basis)
     return law.info | {FILTER_RADIUS: float(spectral_radii(errors).max())}
-
-
-def _process_noise(plant):
-    """The default intensity by state; 0 for lagged inputs."""
-    n_x, lagged, n = plant.n_x, len(plant.lag), len(plant.disturbable)
-    intensity = np.zeros(n_x)
-    intensity[: n_x - lagged] = POSITION_NOISE**2
-    intensity[n_x - lagged - n : n_x - lagged] = VELOCITY_NOISE**2
-    return intensity
 
 
 def _require_lqr(law, plant):

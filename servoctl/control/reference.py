@@ -5,7 +5,7 @@ from math import factorial, perm
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, named, positive, require_memory
+from servoctl.checks import ON_SAMPLE, named, positive, require_kind, require_memory
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
 from servoctl.plants.plant import Plant, part_of
 
@@ -115,13 +115,7 @@ def _lost(A, B):
 
 def require_plant(plant):
     """Refuse anything but a Plant."""
-    if not isinstance(plant, Plant):
-        raise SpecificationError(
-            f"Expected a Plant, got a {type(plant).__name__}.",
-            "Laws are designed for plants, and loops are closed around them.",
-            do="Make the plant of the mechanism: sv.plant(mechanism).",
-            kind=type(plant).__name__,
-        )
+    require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
 
 
 def of_plan(plan, plant):
