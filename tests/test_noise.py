@@ -71,7 +71,7 @@ def test_a_channel_does_not_depend_on_others_nor_on_the_number_of_samples():
 def test_seeds_of_cases_are_those_of_a_sweep(monkeypatch):
     expected = [int(generator(9, i).integers(SEEDS)) for i in range(50)]
     words = [noise.first_words(9, CASES, 50)]
-    monkeypatch.setattr(noise, "_library", lambda lanes, _: None)
+    monkeypatch.setattr(noise, "_library", lambda _: None)
     words += [noise.first_words(9, CASES, 50)]
     for of_cases in words:
         assert (of_cases % 2**32 * SEEDS // 2**32).tolist() == expected

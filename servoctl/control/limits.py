@@ -38,7 +38,6 @@ MET = 1e-7  # of an input's size: distance from a limit at which it is met
 GIVEN_WAY = 1e-6  # of a residual's largest effect: least slack that counts
 STEPS = 100  # of the active-set method, which needs about as many as constraints become active
 WITHIN = 1e-10  # of an input's size, and of the terms of a limit: its admissible violation
-OPEN = 1e300  # stands for infinity in a schedule, which is finite
 DEPENDENT = 1e-9  # sine of the angle between a constraint and others, below which it depends on them
 SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # arguments of `fastest` for a scene
 
@@ -173,12 +172,12 @@ def limited(
     sizes = _sizes(law.plan, plant, H)
     allocation = Allocation(law, plant, effects, bounds, tuple(weights), sizes, np.abs(D).max(axis=0) @ sizes)
     low, high, change = conditions.limits(plant, law.period)
-    numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])
+    numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])  # finite in a schedule
     return replace(
         law,
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
         step=allocation,
-        schedule=_schedule(law, reference, D, H, np.clip(numbers, -OPEN, OPEN)),
+        schedule=_schedule(law, reference, D, H, np.nan_to_num(numbers)),
         state=np.concatenate([law.state, np.clip(law.initial_input, low, high)]),
         state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
         signals=(*law.signals, *allocation.signals),
@@ -336,11 +335,10 @@ class Allocation(Value):
     def _layouts(self):
         """Layouts of the arguments x and column, and of the law's output."""
         law, m, k, n_z = self.law, len(self.sizes), len(self.residuals), len(self.law.state)
-        for_c = m + self.bounds.size + len(self.plant.parameters) + (n_z * m if law.input_matrix is not None else 0)
-        limits, along = {"low": m, "high": m, "change": m}, {"x_ref": self.plant.n_x, "D": (k, m), "H": (m, m)}
+        for_c = 4 * m + self.bounds.size + len(self.plant.parameters) + (n_z * m if law.input_matrix is not None else 0)
         return (
             Layout(y=len(law.measures), z=n_z, last=m),
-            Layout(column=law.schedule.shape[0], **limits, for_c=for_c, **along),
+            Layout(column=law.schedule.shape[0], for_c=for_c, x_ref=self.plant.n_x, D=(k, m), H=(m, m)),
             Layout(u=m, z=n_z, signals=len(law.signals)),
         )
 
@@ -348,6 +346,11 @@ class Allocation(Value):
     def measured(self):
         """Indices of the measured states."""
         return [self.plant.state_names.index(name) for name in self.law.measures]
+
+    @cached_property
+    def _limits(self):
+        """Lower and upper limits, and the largest change in a sample, (m,) each."""
+        return conditions.limits(self.plant, self.law.period)
 
     @cached_property
     def _qp(self):
@@ -402,8 +405,8 @@ class Allocation(Value):
         desired = of_output.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
         state = along.x_ref.copy()
         state[self.measured] = now.y
-        low = np.maximum(along.low, now.last - along.change)
-        high = np.minimum(along.high, now.last + along.change)
+        low, high, change = self._limits
+        low, high = np.maximum(low, now.last - change), np.minimum(high, now.last + change)
         c, O = self.effects(t, state)
         u = self._allocate(t, desired.u, low, high, along.H, c, O)
         difference = u - desired.u

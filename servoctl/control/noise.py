@@ -34,7 +34,7 @@ def normal(seed, count, channels):
 
 def first_words(seed, kind, count):
     """The first word of channels 0 .. count - 1 of a kind, (count,) uint64; noise is kind 0."""
-    y, library = np.empty(count, dtype=np.uint64), _library(compiler.lanes(), compiler.compiler())
+    y, library = np.empty(count, dtype=np.uint64), _library(compiler.compiler())
     if library is None:
         words = (np.random.Philox(key=key(seed), counter=[0, channel, kind, 0]) for channel in range(count))
         return np.array([word.random_raw() for word in words], dtype=np.uint64)
@@ -43,7 +43,6 @@ def first_words(seed, kind, count):
 
 
 @cache
-def _library(lanes, _compiler):
-    """The compiled functions for a number of lanes and a compiler; None without one."""
-    text = f"#define W_LANES {lanes}\n{emit.unit({'NAME': 'normal'})}{emit.include('normal.c')}"
-    return compiler.library(text, level="-O3")
+def _library(_compiler):
+    """The compiled function for a compiler; None without one."""
+    return compiler.library(f"{emit.unit({'NAME': 'normal'})}{emit.include('normal.c')}", level="-O3")

@@ -201,13 +201,13 @@ class Plant(Value, Shown):
         -------
         (n_p,) or (n_p, N) array
         """
-        u = np.zeros(len(self.inputs)) if u is None else _sized("u", u, len(self.inputs))
-        d = np.zeros(len(self.disturbable)) if d is None else _sized("d", d, len(self.disturbable))
-        if u.ndim == 1:
-            return np.concatenate([self.parameters, u, array_of("d", d, len(self.disturbable))])
-        fixed = np.repeat(self.parameters[:, None], u.shape[1], axis=1)
-        d = np.repeat(d[:, None], u.shape[1], axis=1) if d.ndim == 1 else _sized("d", d, len(d), u.shape[1])
-        return np.concatenate([fixed, u, d])
+        m, n = len(self.inputs), len(self.disturbable)
+        u = np.zeros(m) if u is None else as_numbers(u)
+        d = np.zeros(n) if d is None else array_of("d", d, n)
+        if u.ndim != 2 or len(u) != m:
+            return np.concatenate([self.parameters, array_of("u", u, m), d])
+        fixed, d = (np.repeat(part[:, None], u.shape[1], axis=1) for part in (self.parameters, d))
+        return np.concatenate([fixed, u, d])  # u is NaN where a motion ended
 
     def disturbed(self, name):
         """The index in p of what a disturbance acts on.
@@ -392,14 +392,6 @@ class Plant(Value, Shown):
             "  damping: ": _text(self.damping),
         }
         return "\n".join(f"{what}{text}"[:118] for what, text in entries.items() if text)
-
-
-def _sized(name, value, size, count=None):
-    """Values (size,) or (size, N), NaN where a motion ended; N is `count`, if that is given."""
-    array = as_numbers(value)
-    if array.ndim == 2 and len(array) == size and count in (None, array.shape[1]):
-        return array
-    return array_of(name, value, size) if count is None else array_of(name, value, size, count)
 
 
 def _text(values):
