@@ -141,21 +141,9 @@ class Law(Value, Shown):
         SpecificationError
             If `step` does not return n_out numbers.
         """
-        answer = self.step(t, x, column)
-        try:
-            out = np.asarray(answer, dtype=float).ravel()
-        except (TypeError, ValueError):
-            out = np.zeros(0)
-        if out.size != self.n_out:
-            raise SpecificationError(
-                f"The law {self.name!r} returned {answer!r} at t = {t:.6g} s."[:200],
-                f"Its output is {self.n_out} numbers: {', '.join((*self.inputs, *self.state_names, *self.signals))}.",
-                do="Return a sequence of them in this order.",
-                name=self.name,
-                t=float(t),
-                n_out=self.n_out,
-            )
-        return out
+        states = self.state_names or (f"state {i}" for i in range(len(self.state)))
+        names = (*self.inputs, *states, *self.signals)
+        return ordered(self.step(t, x, column), names, f"output of the law {self.name!r}", t=float(t))
 
     def begin(self):
         """The step for one run: a compiled step as it is, another one checked at each sample.
@@ -312,7 +300,7 @@ class UserStep:
     def __call__(self, t, x, _column):
         """The inputs, (m,), of the measured states x, (n_y,), at t [s]."""
         u = self.function(t, dict(zip(self.states, x.tolist(), strict=True)))
-        return ordered(u, self.inputs, f"output of the law {self.name!r} at t = {t:.6g} s")
+        return ordered(u, self.inputs, f"output of the law {self.name!r}", t=float(t))
 
 
 def sample_at(t, t0, period, last, whose):
@@ -334,10 +322,11 @@ def sample_at(t, t0, period, last, whose):
     return k
 
 
-def ordered(values, names, what, exactly=True):
+def ordered(values, names, what, exactly=True, t=None):
     """Numbers in the order of their names, (n,), from an array in this order or from a dict.
 
-    `what` the values are ("measurement") goes into messages; `exactly` refuses further names in a dict.
+    `what` the values are ("measurement") and the instant t [s] go into messages; `exactly` refuses further names in a
+    dict.
     """
     numbers = values
     if isinstance(values, dict):
@@ -353,10 +342,11 @@ def ordered(values, names, what, exactly=True):
         numbers = np.zeros(0)
     if numbers.shape != (len(names),):
         raise SpecificationError(
-            f"The {what} is {values!r}."[:200],
+            f"The {what} is {values!r}"[:200] + ("." if t is None else f" at t = {t:.6g} s."),
             f"It has {len(names)} numbers: {', '.join(names) or '(none)'}.",
             do="Pass them in this order, or as a dict.",
             names=names,
             what=what,
+            t=t,
         )
     return numbers

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import field, fields, replace
 from functools import cached_property
-from math import prod
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -42,19 +40,6 @@ DEPENDENT = 1e-9  # sine of the angle between a constraint and others, below whi
 SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # arguments of `fastest` for a scene
 
 
-class Layout:
-    """Named parts of a vector, in this order; matrices row by row."""
-
-    def __init__(self, **shapes):
-        shapes = {name: (shape,) if isinstance(shape, int) else shape for name, shape in shapes.items()}
-        ends = np.cumsum([0, *(prod(shape) for shape in shapes.values())]).tolist()
-        self._parts = [(name, slice(*ends[i : i + 2]), shape) for i, (name, shape) in enumerate(shapes.items())]
-
-    def split(self, vector):
-        """The parts by name, as attributes."""
-        return SimpleNamespace(**{name: vector[part].reshape(shape) for name, part, shape in self._parts})
-
-
 class Effects:
     """The immediate effects of inputs: o = c + O u for expressions of t, q, γ' and γ'', affine in the inputs."""
 
@@ -85,31 +70,6 @@ class Effects:
         j, m = len(self.names), len(self._plant.inputs)
         y = self._function(t, x, self._plant.parameters)
         return y[:j], y[j:].reshape(m, j).T
-
-
-class SmallQP:
-    """min xᵀH x/2 of n unknowns subject to low <= x <= high and least <= A x <= most, by DAQP through CasADi."""
-
-    def __init__(self, n, rows):
-        shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
-        self._solve = ca.conic("qp", "daqp", shapes, {"error_on_fail": False})
-        self._g, self._sizes = np.zeros(n), (n, rows)
-
-    def __reduce__(self):
-        return SmallQP, self._sizes
-
-    def __call__(self, H, low, high, A, least, most):
-        """The solution (n,), or None if there is none."""
-        try:
-            solution = self._solve(h=H, g=self._g, a=A, lba=least, uba=most, lbx=low, ubx=high)
-        except RuntimeError as error:  # CasADi's only type
-            raise ServoError(
-                f"The quadratic program of the allocation failed: {str(error).splitlines()[0][:100]}.",
-                "Its data are finite numbers.",
-                do="Check weights and limits for very large numbers.",
-                size=self._sizes,
-            ) from error
-        return np.asarray(solution["x"]).ravel() if self._solve.stats()["success"] else None
 
 
 def limited(
@@ -332,17 +292,6 @@ class Allocation(Value):
         return (*(f"slack {name}" for name in self.residuals), *(f"{kind} {name}" for kind, name in self.limits))
 
     @cached_property
-    def _layouts(self):
-        """Layouts of the arguments x and column, and of the law's output."""
-        law, m, k, n_z = self.law, len(self.sizes), len(self.residuals), len(self.law.state)
-        for_c = 4 * m + self.bounds.size + len(self.plant.parameters) + (n_z * m if law.input_matrix is not None else 0)
-        return (
-            Layout(y=len(law.measures), z=n_z, last=m),
-            Layout(column=law.schedule.shape[0], for_c=for_c, x_ref=self.plant.n_x, D=(k, m), H=(m, m)),
-            Layout(u=m, z=n_z, signals=len(law.signals)),
-        )
-
-    @cached_property
     def measured(self):
         """Indices of the measured states."""
         return [self.plant.state_names.index(name) for name in self.law.measures]
@@ -354,7 +303,10 @@ class Allocation(Value):
 
     @cached_property
     def _qp(self):
-        return SmallQP(len(self.sizes), len(self.bounds))
+        """min vᵀH v/2 subject to lbx <= v <= ubx and lba <= A v <= uba, by DAQP through CasADi."""
+        m, j = len(self.sizes), len(self.bounds)
+        shapes = {"h": ca.Sparsity.dense(m, m), "a": ca.Sparsity.dense(j, m)}
+        return ca.conic("qp", "daqp", shapes, {"error_on_fail": False})
 
     def native(self, suffix):
         """The same in C, `NAME_suffix`; None without a compiler, or for a law in Python."""
@@ -400,29 +352,31 @@ class Allocation(Value):
 
     def __call__(self, t, x, column):
         """The inputs, the next controller state and the signals, in one array."""
-        of_x, of_column, of_output = self._layouts
-        now, along = of_x.split(x), of_column.split(column)
-        desired = of_output.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
-        state = along.x_ref.copy()
-        state[self.measured] = now.y
+        law, n_x, m, k = self.law, self.plant.n_x, len(self.sizes), len(self.residuals)
+        y, z, last = np.split(x, np.cumsum([len(law.measures), len(law.state)]))
+        answer = law.answer(t, np.concatenate([y, z]), column[: len(law.schedule)])
+        desired, z_next, signals = np.split(answer, [m, m + len(law.state)])
+        state, D, H = np.split(column[-(n_x + k * m + m * m) :].copy(), [n_x, n_x + k * m])
+        D, H = D.reshape(k, m), H.reshape(m, m)
+        state[self.measured] = y
         low, high, change = self._limits
-        low, high = np.maximum(low, now.last - change), np.minimum(high, now.last + change)
+        low, high = np.maximum(low, last - change), np.minimum(high, last + change)
         c, O = self.effects(t, state)
-        u = self._allocate(t, desired.u, low, high, along.H, c, O)
-        difference = u - desired.u
-        slack = along.D @ difference
-        gives_way = np.any(np.abs(slack) > GIVEN_WAY * (np.abs(along.D) @ self.sizes))
-        z = self._advanced(t, now.z, desired.z, gives_way, difference)
+        u = self._allocate(t, desired, low, high, H, c, O)
+        difference = u - desired
+        slack = D @ difference
+        gives_way = np.any(np.abs(slack) > GIVEN_WAY * (np.abs(D) @ self.sizes))
+        z = self._advanced(t, z, z_next, gives_way, difference)
         room = MET * self.sizes
         active = np.where(u <= low + room, -1.0, np.where(u >= high - room, 1.0, 0.0)) * (np.abs(difference) > room)
         reached = np.where(np.abs(c + O @ u - self.bounds.T) <= MET * (np.abs(O) @ self.sizes), [[-1.0], [1.0]], 0.0)
-        return np.concatenate([u, z, u, desired.signals, slack, active, reached.sum(axis=0)])
+        return np.concatenate([u, z, u, signals, slack, active, reached.sum(axis=0)])
 
     def _advanced(self, t, z, z_next, gives_way, difference):
         """The next controller state: integrals are held while there is slack, an estimate takes the inputs that act."""
-        law, z_next = self.law, z_next.copy()
-        if gives_way and law.integrators:
-            z_next[list(law.integrators)] = z[list(law.integrators)]
+        law, held = self.law, list(self.law.integrators) if gives_way else []
+        z_next = z_next.copy()
+        z_next[held] = z[held]
         if law.input_matrix is None:
             return z_next
         k = min(round((t - law.t0) * law.rate), len(law.input_matrix) - 1)
@@ -436,12 +390,20 @@ class Allocation(Value):
         S, A = np.diag(self.sizes), O * self.sizes
         # rows are scaled to entries of order one, for the tolerance of the solver
         scale = np.maximum(np.abs(A).max(axis=1, initial=0.0), TINY)
-        H = S @ H @ S
-        ends = (low - desired) / self.sizes, (high - desired) / self.sizes
-        v = self._qp(H / np.abs(H).max(), *ends, A / scale[:, None], least / scale, most / scale)
-        if v is None:
+        H, A = S @ H @ S, A / scale[:, None]
+        sides = {"lbx": (low - desired) / self.sizes, "ubx": (high - desired) / self.sizes}
+        sides |= {"lba": least / scale, "uba": most / scale}
+        try:
+            v = self._qp(h=H / np.abs(H).max(), a=A, **sides)["x"]
+        except RuntimeError as error:  # CasADi's only type
+            raise ServoError(
+                f"The quadratic program of the allocation failed: {str(error).splitlines()[0][:100]}.",
+                "Its data are finite numbers.",
+                do="Check weights and limits for very large numbers.",
+            ) from error
+        if not self._qp.stats()["success"]:
             raise self._infeasible(t, low, high)
-        return np.clip(desired + self.sizes * v, low, high)
+        return np.clip(desired + self.sizes * np.asarray(v).ravel(), low, high)
 
     def _infeasible(self, t, low, high):
         names = self.plant.inputs

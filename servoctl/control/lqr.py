@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, numbers_by_name, rows_read
 from servoctl.codegen.matrices import riccati
-from servoctl.control.feedback import StateFeedback, affine
+from servoctl.control.feedback import StateFeedback, affine, integral_names
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, of_plan, refuse_transport
 from servoctl.control.residuals import Residuals, program_residuals
@@ -97,14 +97,14 @@ def lqr(
     residuals, Q_i = _integrals(integral, plan, plant)
     A, B = discretised(*reference.linearised(), reference.period)
     augmented = _with_integrals(A, B, Q, residuals, Q_i, reference) if residuals else (A, B, Q)
-    basis = tangents(reference, 0 if residuals is None else len(Q_i))
-    names = (*plant.state_names, *(f"integral of {name}" for name in (residuals.names if residuals else ())))
+    integrated = residuals.names if residuals else ()
+    basis = tangents(reference, len(integrated))
+    names = (*plant.state_names, *integral_names(integrated))
     try:
         K = _varying(*augmented, R, basis) if varying else steady(*augmented, R, basis)[0]
     except ServoError as error:
         raise _explained(error, augmented, basis, names, plant, varying) from None
     K_x, K_i = np.split(K, [plant.n_x], axis=2)
-    integrated = residuals.names if residuals else ()
     how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
     known = {"gains": K, "Q": augmented[2], "R": R, "integrated": integrated, "states": plant.state_names}
     info = Deferred(known, (LARGEST_RADIUS, LAST_RADIUS), partial(_radii, augmented[:2], K, basis))

@@ -115,20 +115,26 @@ def part_of(whole, mechanism):
         return whole
     kinds = (("q", source.q.names, q.names), ("w", source.q.velocity_names, q.velocity_names))
     places = {(kind, i) for kind, names, kept in kinds for i, name in enumerate(names) if name in kept}
-    forces = dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True))
-    rows = [{("w", i), *source.places(force)} for i, force in enumerate(forces.values())]
+    rows = [{("w", i), *source.places(force)} for i, force in enumerate(whole.equations.forces.elements())]
     if any(row & places and not row <= places for row in (*source.couplings(), *rows)):
         return whole
-    part = source.part(places)
-    names = part.q.force_names
-    by_actuator = ("limits", "rate_limits", "lag", "delay")
+    part, by_actuator = source.part(places), ("limits", "rate_limits", "lag", "delay")
     numbers = {what: {n: v for n, v in getattr(whole, what).items() if n in part.actuators} for what in by_actuator}
+    return made_again(whole, part, **numbers)
+
+
+def made_again(whole, mechanism, **of_actuators):
+    """The plant of a mechanism with the forces, damping and parameters of a whole one."""
+    names, forces = (
+        mechanism.q.force_names,
+        dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True)),
+    )
     return plant(
-        part,
+        mechanism,
         forces={name: forces[name] for name in names if not forces[name].is_zero()},
         damping={name: c for name, c in whole.damping.items() if name in names},
-        **numbers,
-        **dict(zip(part.parameters.names, whole.parameters.tolist(), strict=False)),
+        **of_actuators,
+        **dict(zip(mechanism.parameters.names, whole.parameters.tolist(), strict=False)),
     )
 
 
