@@ -115,9 +115,6 @@ def test_wrong_runs_of_a_plant_do_not_pass(machine, part):
         model = sv.simulate(plant, START, (0.0, 0.1), inputs={"trolley": 5 * ca.sin(t)}).model
     if part == "an input":
         model = sv.simulate(machine, START, (0.0, 0.1), inputs={"trolley": 5.01 * ca.sin(t)}).model
-    if part != "states":
-        with refused(sv.errors.SpecificationError):
-            sv.verify(run)
     jets = run.jets if part != "states" else run.jets * np.where(np.arange(len(run.t)) == 500, 1.001, 1.0)
     assert not sv.verify(replace(run, model=model, jets=jets, variants=(), stored={}, stored_residual={})).passed
 

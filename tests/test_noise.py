@@ -44,16 +44,6 @@ def test_words_are_those_of_numpy_and_the_known_ones(name):
     assert (" ".join(f"{int(word):016x}" for word in y) == KNOWN) == (name == "zeros")
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2**31 - 1, 2**64 + 5])
-@pytest.mark.parametrize("lanes", [1, 4, 8])
-def test_compiled_numbers_are_those_of_numpy(seed, lanes, monkeypatch):
-    monkeypatch.setattr(compiler, "lanes", lambda: lanes)
-    y = noise.normal(seed, 1003, [0, 5])
-    for column, channel in zip(y.T, (0, 5), strict=True):
-        assert column == pytest.approx(noise._by_numpy(seed, channel, 1003), rel=1e-13, abs=1e-14)
-    assert np.array_equal(noise.normal(seed, 10, [5])[:, 0], y[:10, 1])
-
-
 def test_numbers_are_normal_and_independent():
     y = np.stack([noise.normal(seed, COUNT, [0, 1]) for seed in (11, 12)]).transpose(0, 2, 1).reshape(4, COUNT)
     bins = stats.norm.ppf(np.linspace(0, 1, 1001))
@@ -81,7 +71,7 @@ def test_a_channel_does_not_depend_on_others_nor_on_the_number_of_samples():
 def test_seeds_of_cases_are_those_of_a_sweep(monkeypatch):
     expected = [int(generator(9, i).integers(SEEDS)) for i in range(50)]
     words = [noise.first_words(9, CASES, 50)]
-    monkeypatch.setattr(noise, "_library", lambda lanes, _: None)
+    monkeypatch.setattr(noise, "_library", lambda _: None)
     words += [noise.first_words(9, CASES, 50)]
     for of_cases in words:
         assert (of_cases % 2**32 * SEEDS // 2**32).tolist() == expected

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 from refusals import refused
-from scipy.linalg import matrix_balance
 from scipy.optimize import brentq
 
 import servoctl as sv
-from servoctl.control.sampling import balancing, sampled_radii
+from servoctl.control.sampling import sampled_radii
 
 q = sv.coordinates("x")
 (x,) = q
@@ -48,19 +47,3 @@ def test_a_transport_delay_too_long_for_the_gains_is_refused():
         assert law.info["largest spectral radius along the plan"] == pytest.approx(radius, rel=1e-9) and radius < 1.0
     with refused(sv.errors.ServoError, "0.1 s", radius=pytest.approx(1.058, abs=5e-4)):
         sv.pd(point_plan, sv.plant(POINT, delay=0.1), **gains)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_matrices_are_balanced_by_powers_of_two(seed):
-    rng, n = np.random.default_rng(seed), 2 + seed % 7
-    units = 10.0 ** rng.integers(-8, 8, size=n)
-    sizes = rng.uniform(size=(n, n)) * (rng.uniform(size=(n, n)) < 0.6) * units[:, None] / units
-    scales = balancing(sizes)
-    assert np.array_equal(np.frexp(scales)[0], np.full(n, 0.5))
-    reached = np.linalg.norm(matrix_balance(sizes, permute=False)[0])
-    assert np.linalg.norm(sizes * scales / scales[:, None]) <= 1.5 * reached
-
-
-@pytest.mark.parametrize("entry", [0.0, 1e-300, 1e300, np.inf, np.nan])
-def test_balancing_ends_at_every_matrix(entry):
-    assert np.isfinite(balancing(np.array([[0.0, entry], [1e-300, 0.0]]))).all()

@@ -14,7 +14,6 @@ from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, L
 from servoctl.control.reference import Reference, of_plan, require_plan, require_plant, resampled
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
-from servoctl.methods.dropped import DERIVATIONS, came_alive, first_alive
 from servoctl.plants.plant import Plant
 from servoctl.reduction.orders import other_order
 from servoctl.run import Run
@@ -89,40 +88,8 @@ def close(
     if plan is not None:
         require_plan(plan, plant)
     plan = law.plan if plan is None else plan
-    for _ in range(DERIVATIONS):
-        plant = regular_at_start(plant, t_span[0], x0)
-        run = finished(plant, law, plan, loop_of(plant, law, x0, t_span, conditions), conditions)
-        t, equations = _derived_along(run)
-        if equations is None:
-            return run
-        plant = replace(plant, equations=equations)
-    raise _stopped_at(run, came_alive(t))
-
-
-def regular_at_start(plant, t0, x0):
-    """The plant, with pivots decided near the start of a loop if those decided elsewhere vanish there."""
-    if not plant.constrained:
-        return plant
-    rest = np.zeros(len(plant.inputs))
-    x = _initial_state(plant, t0, x0, rest)
-    return plant if np.isfinite(plant.rates(t0, x, rest)).all() else plant.near(t0, x)
-
-
-def _derived_along(run):
-    """The instant at which an entry that eliminations left out comes alive, and equations derived near it; or None."""
-    plant, equations, t, x = run.plant, run.plant.equations, run.t, run.states
-    if equations.dropped is None:
-        return None, None
-    values = plant.parameters[: len(equations.values)]
-
-    def entries(some):
-        return equations.entries_dropped, equations.points_at(t[some], x[:, some], values)
-
-    found = first_alive(equations.dropped, entries, t, x, plant.p())
-    if found is None:
-        return None, None
-    first, clearest = found
-    return float(t[first]), equations.near(float(t[clearest]), x[:, clearest], values)
+    plant, loop = loop_of(plant, law, x0, t_span, conditions)
+    return finished(plant, law, plan, loop, conditions)
 
 
 def _of_start(plant, plan, x0):
@@ -135,7 +102,7 @@ def _of_start(plant, plan, x0):
 
 
 def loop_of(plant, law, x0, t_span, conditions):
-    """All numbers of the loop, in tables made beforehand."""
+    """The plant, with pivots that do not vanish at the start, and all numbers of the loop, in tables."""
     (t0, t1), sensors, timing, forces = t_span, conditions.sensors, conditions.timing, conditions.disturbance
     samples = whole_multiple((t1 - t0) * law.rate, f"t_span of {t1 - t0:g} s at {law.rate:g} Hz", "samples")
     stored = plant.n_x + len(law.measures) + len(law.state) + law.n_out + len(plant.inputs) + len(sensors.noise)
@@ -143,12 +110,13 @@ def loop_of(plant, law, x0, t_span, conditions):
     disturbed = np.array([plant.disturbed(name) for name in forces], dtype=np.int64)
     first = whole_multiple((t0 - law.t0) * law.rate, f"A start at {t0:g} s of a law from {law.t0:g} s on", "samples")
     low, high, change = limits(plant, law.period)
-    initial = _initial_input(law, t0)
-    initial = initial if low is None else np.clip(initial, low, high)
+    initial = np.clip(_initial_input(law, t0), low, high)
     x0 = _initial_state(plant, t0, x0, initial)
+    if plant.constrained and not np.isfinite(plant.rates(t0, x0, initial)).all():
+        plant = plant.near(t0, x0)
     substeps, transport = steps(plant, law.period, timing.substeps, t0, x0, initial)
     require_few_steps(samples, substeps, plant.function("ode").operations)
-    return Loop(
+    loop = Loop(
         samples=samples,
         substeps=substeps,
         delay=timing.delay,
@@ -173,6 +141,7 @@ def loop_of(plant, law, x0, t_span, conditions):
         transport=transport,
         **conditions.forces(t0, law.period / substeps, samples * substeps),
     )
+    return plant, loop
 
 
 def _initial_input(law, t0):
@@ -189,8 +158,7 @@ def _initial_state(plant, t0, x0, initial_input):
     x = plant.state(x0)
     for i, name in enumerate(plant.lagged, len(x) - len(plant.lag)):
         x[i] = initial_input[plant.inputs.index(name)] if np.isnan(x[i]) else x[i]
-    if plant.constrained:
-        require_consistent(plant, t0, x[:, None], plant.p()[:, None])
+    require_consistent(plant, t0, x[:, None], plant.p()[:, None])
     return x
 
 
@@ -219,9 +187,7 @@ def finished(plant, law, plan, loop, conditions, advance=None):
     status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop, advance)
     if status == INTERRUPTED and not len(x):
         raise KeyboardInterrupt
-    t = np.arange(len(x), dtype=float)
-    t *= loop.period
-    t += loop.t0
+    t = loop.t0 + np.arange(len(x)) * loop.period
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.state)
     end = loop.t0 + len(x) * loop.period
     message = {
@@ -261,13 +227,9 @@ def _of_same_orders(run):
     k, row = equations.orders.first_change(run.t, states, values)
     if k is None:
         return run
-    raise _stopped_at(run, other_order(row, float(run.t[k])))
-
-
-def _stopped_at(run, error):
-    """The error that stops a loop, with the run."""
+    error = other_order(row, float(run.t[k]))
     error.run = replace(run, success=False, status=-1, message=f"stopped: {str(error).split('. ')[0]}")
-    return error
+    raise error
 
 
 def _stopped(law, loop, status, end):

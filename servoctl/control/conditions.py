@@ -13,6 +13,7 @@ from servoctl.checks import (
     named,
     numbers_by_name,
     positive,
+    require_kind,
     require_memory,
     texts,
     whole,
@@ -149,15 +150,7 @@ class Conditions:
     def __post_init__(self):
         for name, kind in (("sensors", Sensors), ("timing", Timing)):
             value = kind() if getattr(self, name) is None else getattr(self, name)
-            if not isinstance(value, kind):
-                raise SpecificationError(
-                    f"{name} is {value!r}."[:200],
-                    f"It is a value of sv.{kind.__name__}.",
-                    do=f"Write {name}=sv.{kind.__name__}(...).",
-                    name=name,
-                    kind=type(value).__name__,
-                )
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, require_kind(kind, name, value, f"sv.{kind.__name__}(...)"))
         object.__setattr__(self, "disturbance", dict(mapping(self.disturbance, "The disturbances")))
 
     def forces(self, t0, h, count, finer=1):
@@ -199,19 +192,10 @@ def index(name, names, what):
     return names.index(named(name, names, what))
 
 
-def ranges(plant, period):
+def limits(plant, period):
     """Lower and upper limits of the inputs, and the largest change in a sample, (m,) each; infinite without any."""
     low, high = np.array([plant.limits.get(name, (-np.inf, np.inf)) for name in plant.inputs]).reshape(-1, 2).T
     return low, high, np.array([plant.rate_limits.get(name, np.inf) for name in plant.inputs]) * period
-
-
-def limits(plant, period):
-    """The same three arrays; None for limits or rate limits that the plant does not have."""
-    if not plant.limits and not plant.rate_limits:
-        return None, None, None
-    low, high, change = ranges(plant, period)
-    low, high = (low, high) if plant.limits else (None, None)
-    return low, high, change if plant.rate_limits else None
 
 
 def require_few_steps(samples, substeps, operations):
@@ -232,21 +216,16 @@ def require_few_steps(samples, substeps, operations):
 
 def steps(plant, period, substeps, t0, x0, u0):
     """Integration steps per sample, and transport delays in such steps, (m,) integers or None without any."""
-    if substeps is not None and not plant.delay:
-        return substeps, None
     delays = np.array([plant.delay.get(name, 0.0) for name in plant.inputs])
     if substeps is None:
         least = _resolving(plant, period, t0, x0, u0)
         fitting = (n for n in range(least, MOST_SUBSTEPS + 1) if _fits(delays * n / period))
         substeps = next(fitting, least)
-        substeps = whole("substeps", substeps, least=1)
-    if not plant.delay:
-        return substeps, None
     late = delays * substeps / period
     if not _fits(late):
         name = plant.inputs[int(np.argmax(np.abs(late - np.rint(late))))]
         raise _split_delay(name, plant.delay[name], period, substeps)
-    return substeps, np.rint(late).astype(np.int64)
+    return substeps, np.rint(late).astype(np.int64) if plant.delay else None
 
 
 def _split_delay(name, delay, period, substeps):

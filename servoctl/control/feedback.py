@@ -30,12 +30,17 @@ def affine_law(measures, n_u, residuals=None):
     y, z, y_ref = ca.SX.sym("y", n_y), ca.SX.sym("z", n_z), ca.SX.sym("y_ref", n_y)
     K, K_i = ca.SX.sym("K", n_y, n_u), ca.SX.sym("K_i", n_z, n_u)
     u = u_ff - K.T @ (y - y_ref) - K_i.T @ z
-    column = [u_ff, y_ref, ca.vec(K), ca.vec(K_i)]
-    if not n_z:
-        return law_step("affine", t, y, ca.vertcat(*column), [u])
+    further, z_next = integrating(residuals, t, y, measures, z)
+    column = ca.vertcat(u_ff, y_ref, ca.vec(K), ca.vec(K_i), *further)
+    return law_step("affine", t, ca.vertcat(y, z), column, [u, *z_next])
+
+
+def integrating(residuals, t, y, measures, z):
+    """Ts and the parameters of φ at the end of a column, and z+ = z + Ts φ(t, y); nothing without residuals."""
+    if not residuals:
+        return [], []
     period, p = ca.SX.sym("Ts"), ca.SX.sym("p", residuals.parameters.size)
-    phi = residuals.expression(t, y, measures, p)
-    return law_step("affine", t, ca.vertcat(y, z), ca.vertcat(*column, period, p), [u, z + period * phi])
+    return [period, p], [z + period * residuals.expression(t, y, measures, p)]
 
 
 class StateFeedback(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from servoctl.checks import as_complex, by_name, is_number, positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
-from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plan
+from servoctl.control.reference import Reference, of_plan, refuse_transport
 from servoctl.control.residuals import in_symbols_of
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics
@@ -27,7 +27,6 @@ from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
 from servoctl.reduction.realisation import wished
 from servoctl.run import Run
-from servoctl.values import frozen
 
 PLAN_POINTS = 129  # states of the plan at which a choice of rows must be regular
 WEAK = 0.05  # of its largest size along the plan: a smaller determinant is no choice of rows
@@ -39,26 +38,8 @@ MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until
 TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
 
 
-@frozen
-class Linearisation:
-    """The exact linearisation of a program; made by `linearise`.
-
-    `orders` are those of the error dynamics by residual, i.e. relative degrees with the extension, `relative_degree`
-    those without. The controller state ξ, with the names `state_names`, are derivatives of residuals behind
-    integrators, or inputs; `start` (n_ξ,) are their values on the plan. `step` maps (t, [x; ξ], column) to [u; ξ+]; the
-    column is [plant's parameters; Ts; increment of u;
-    coefficients of the error dynamics].
-    """
-
-    orders: dict
-    relative_degree: dict
-    state_names: tuple
-    start: np.ndarray
-    step: object
-
-
 def linearise(plan, plant):
-    """Exact linearisation of the plan's program by the inputs of a plant; ranks are decided about the plan's states.
+    """The extension that a plant needs for exact linearisation of a program; ranks are decided about the plan's states.
 
     Refuses residuals of an order above 2, a plant of another mechanism, and residuals that depend on no input.
     """
@@ -74,7 +55,7 @@ def linearise(plan, plant):
         extension.share(**in_symbols_of(plant, plan.model, parts))
     while extension.rank() < len(extension.names):
         extension.extend()
-    return extension.law()
+    return extension
 
 
 def _require_invertible(reduction, plant):
@@ -125,7 +106,11 @@ def _without_units(matrices):
 
 
 class _Extension:
-    """A plant with integrators before some of its inputs, and its program's residuals differentiated along it."""
+    """A plant with integrators before some of its inputs, and its program's residuals differentiated along it.
+
+    The controller state ξ, with the names `state_names`, are derivatives of residuals behind integrators, or inputs.
+    `relative_degree` are the orders of the residuals without the extension.
+    """
 
     def __init__(self, plant, residuals, points, along):
         e = plant.equations
@@ -142,7 +127,12 @@ class _Extension:
         self.levels = [[ca.substitute(ca.SX(residual), jets, acceleration)] for residual in residuals.values()]
         for level in self.levels:
             self._differentiate(level)
-        self.relative_degree = {name: len(level) - 1 for name, level in zip(self.names, self.levels, strict=True)}
+        self.relative_degree = self.orders
+
+    @property
+    def orders(self):
+        """Orders of the error dynamics by residual: their relative degrees with the extension so far."""
+        return {name: len(level) - 1 for name, level in zip(self.names, self.levels, strict=True)}
 
     def _rate(self, expression):
         """The total derivative along the extended plant."""
@@ -306,10 +296,12 @@ class _Extension:
         rest = iter(parts[3:])
         self.levels = [[next(rest) for _ in level] for level in self.levels]
 
-    def law(self):
-        """The linearisation by a decoupling matrix of full rank."""
-        D, counts = self.decoupling, [len(level) - 1 for level in self.levels]
-        c = [ca.SX.sym(f"c_{name}", count) for name, count in zip(self.names, counts, strict=True)]
+    def step(self):
+        """The linearisation by a decoupling matrix of full rank: (t, [x; ξ], column) -> [u; ξ+].
+
+        The column is [plant's parameters; Ts; increment of u; coefficients of the error dynamics].
+        """
+        D, c = self.decoupling, [ca.SX.sym(f"c_{name}", order) for name, order in self.orders.items()]
         tops = [ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape)) for level in self.levels]
         errors = (ca.dot(ci, ca.vertcat(*level[:-1])) for ci, level in zip(c, self.levels, strict=True))
         target = -ca.vertcat(*(top + error for top, error in zip(tops, errors, strict=True)))
@@ -317,10 +309,7 @@ class _Extension:
         period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
         column = ca.vertcat(self.numbers, period, ahead, *c)
         outputs = [self.u + ahead, self._advanced(period)]
-        step = law_step("computed", self.t, ca.vertcat(self.x, self.xi), column, outputs)
-        orders = dict(zip(self.names, counts, strict=True))
-        start = self.controller_states(*(values[:1] for values in self.along))[0]
-        return Linearisation(orders, self.relative_degree, tuple(self.state_names), start, step)
+        return law_step("computed", self.t, ca.vertcat(self.x, self.xi), column, outputs)
 
     def _solved(self, D, target):
         """v with D v = target: the only one, or the one of least norm, of the inputs if they still have to share."""
@@ -389,9 +378,8 @@ def computed(
     NotRealisable
         If a residual depends on no input.
     """
-    rate = positive("rate", rate)
     plant = of_plan(plan, plant)
-    require_plan(plan, plant)
+    reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
     _require_stable(plan)
@@ -399,23 +387,22 @@ def computed(
     _require_smooth(plan, linear.orders)
     poles = _poles(poles, linear.orders)
     for name, values in poles.items():
-        _require_slow(name, values, rate, delay)
+        _require_slow(name, values, reference.rate, delay)
     coefficients = [np.poly(values).real[:0:-1] for values in poles.values() if len(values)]
-    ahead = Reference(plan, plant, rate).ahead(delay)
-    columns = ([plant.parameters, [1.0 / rate], u, *coefficients] for u in ahead.T)
+    columns = ([plant.parameters, [reference.period], u, *coefficients] for u in reference.ahead(delay).T)
     info = {"orders": linear.orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {order}" for name, order in linear.orders.items())
     return Law(
         name="computed",
         measures=plant.state_names,
         inputs=plant.inputs,
-        rate=rate,
+        rate=reference.rate,
         t0=float(plan.t[0]),
-        step=linear.step,
+        step=linear.step(),
         schedule=np.column_stack([np.concatenate(column) for column in columns]),
-        state=linear.start,
-        state_names=linear.state_names,
-        initial_input=np.array([plan[name][0] for name in plant.inputs]),
+        state=linear.controller_states(*(values[:1] for values in linear.along))[0],
+        state_names=tuple(linear.state_names),
+        initial_input=reference.initial_input,
         plan=plan,
         info=info,
     )
@@ -429,20 +416,16 @@ def _require_smooth(plan, orders):
 
 
 def _require_stable(plan):
+    """Refuse a plan whose internal dynamics are not known to be stable."""
     internal = internal_dynamics(plan)
     if internal.verdict not in ("unstable", "inconclusive"):
         return
     worst, names = float(internal.eigenvalues.real.max(initial=-np.inf)), ", ".join(internal.names)
     facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
-    if internal.verdict == "inconclusive":
-        raise UnstableInternalDynamics(
-            f"The internal dynamics of {names} are inconclusive: {internal.cause}.",
-            "Exact linearisation makes them unobservable and does not stabilise them.",
-            do="Remove this cause, or use sv.lqr.",
-            **facts,
-        )
     raise UnstableInternalDynamics(
-        f"The internal dynamics of {names} are unstable: along the plan errors grow by {internal.growth:.3g} in "
+        f"The internal dynamics of {names} are inconclusive: {internal.cause}."
+        if internal.verdict == "inconclusive"
+        else f"The internal dynamics of {names} are unstable: along the plan errors grow by {internal.growth:.3g} in "
         f"{internal.length:.3g} s (frozen eigenvalues up to {worst:.6g} 1/s).",
         "Exact linearisation makes them unobservable and does not stabilise them.",
         do="Use sv.lqr, which stabilises the whole state about the plan, or choose another output.",

@@ -141,21 +141,9 @@ class Law(Value, Shown):
         SpecificationError
             If `step` does not return n_out numbers.
         """
-        answer = self.step(t, x, column)
-        try:
-            out = np.asarray(answer, dtype=float).ravel()
-        except (TypeError, ValueError):
-            out = np.zeros(0)
-        if out.size != self.n_out:
-            raise SpecificationError(
-                f"The law {self.name!r} returned {answer!r} at t = {t:.6g} s."[:200],
-                f"Its output is {self.n_out} numbers: {', '.join((*self.inputs, *self.state_names, *self.signals))}.",
-                do="Return a sequence of them in this order.",
-                name=self.name,
-                t=float(t),
-                n_out=self.n_out,
-            )
-        return out
+        states = self.state_names or (f"state {i}" for i in range(len(self.state)))
+        names = (*self.inputs, *states, *self.signals)
+        return ordered(self.step(t, x, column), names, f"output of the law {self.name!r}", t=float(t))
 
     def begin(self):
         """The step for one run: a compiled step as it is, another one checked at each sample.
@@ -222,26 +210,14 @@ class Law(Value, Shown):
         SpecificationError
             If t is between samples, before the first, or not finite.
         """
-        t = finite("t", t, "time")
-        k = (t - self.t0) * self.rate
-        if abs(k - round(k)) > ON_SAMPLE or round(k) < 0:
-            nearest = self.t0 + max(round(k), 0) / self.rate
-            raise SpecificationError(
-                f"t = {t:.9g} s is not a sampling instant of the law {self.name!r}.",
-                f"Its samples are at {self.rate:g} Hz from t = {self.t0:g} s on.",
-                nearest=f"t = {nearest:.9g} s.",
-                do="Call it at a sampling instant.",
-                name=self.name,
-                t=t,
-                nearest_t=nearest,
-                rate=self.rate,
-            )
-        return self.schedule[:, min(round(k), self.schedule.shape[1] - 1)]
+        k = sample_at(t, self.t0, self.period, np.inf, f"the law {self.name!r}")
+        return self.schedule[:, min(k, self.schedule.shape[1] - 1)]
 
     def __repr__(self):
         shown = {name: value for name, value in self.info.items() if isinstance(value, (str, int, float))}
+        end = self.t0 + (self.schedule.shape[1] - 1) / self.rate
         lines = [
-            f"Law: {self.name}, {self.rate:g} Hz, t = {self.t0:g} .. {self._end:g} s, then held",
+            f"Law: {self.name}, {self.rate:g} Hz, t = {self.t0:g} .. {end:g} s, then held",
             f"  measures {', '.join(self.measures) or '(nothing)'}"[:118],
             f"  commands {', '.join(self.inputs)}"[:118],
         ]
@@ -249,10 +225,6 @@ class Law(Value, Shown):
             lines.append(f"  controller state: {', '.join(self.state_names)}"[:118])
         lines += [f"  {name}: {v:.4g}" if isinstance(v, float) else f"  {name}: {v}"[:118] for name, v in shown.items()]
         return "\n".join(lines[:12])
-
-    @property
-    def _end(self):
-        return self.t0 + (self.schedule.shape[1] - 1) / self.rate
 
 
 class Controller:
@@ -328,13 +300,33 @@ class UserStep:
     def __call__(self, t, x, _column):
         """The inputs, (m,), of the measured states x, (n_y,), at t [s]."""
         u = self.function(t, dict(zip(self.states, x.tolist(), strict=True)))
-        return ordered(u, self.inputs, f"output of the law {self.name!r} at t = {t:.6g} s")
+        return ordered(u, self.inputs, f"output of the law {self.name!r}", t=float(t))
 
 
-def ordered(values, names, what, exactly=True):
+def sample_at(t, t0, period, last, whose):
+    """The index of the sample at t [s], up to the last; `whose` samples they are goes into the message."""
+    t = finite("t", t, "time")
+    k = min(max(round((t - t0) / period), 0), last)
+    nearest = t0 + k * period
+    if abs(t - nearest) > ON_SAMPLE * period:
+        raise SpecificationError(
+            f"t = {t:.9g} s is not a sampling instant of {whose}.",
+            f"Its samples are {period:g} s apart, from t = {t0:g} s "
+            + (f"to {t0 + last * period:g} s." if last < np.inf else "on."),
+            nearest=f"t = {nearest:.9g} s.",
+            do="Pass a sampling instant.",
+            t=t,
+            nearest_t=nearest,
+            period=period,
+        )
+    return k
+
+
+def ordered(values, names, what, exactly=True, t=None):
     """Numbers in the order of their names, (n,), from an array in this order or from a dict.
 
-    `what` the values are ("measurement") goes into messages; `exactly` refuses further names in a dict.
+    `what` the values are ("measurement") and the instant t [s] go into messages; `exactly` refuses further names in a
+    dict.
     """
     numbers = values
     if isinstance(values, dict):
@@ -350,10 +342,11 @@ def ordered(values, names, what, exactly=True):
         numbers = np.zeros(0)
     if numbers.shape != (len(names),):
         raise SpecificationError(
-            f"The {what} is {values!r}."[:200],
+            f"The {what} is {values!r}"[:200] + ("." if t is None else f" at t = {t:.6g} s."),
             f"It has {len(names)} numbers: {', '.join(names) or '(none)'}.",
             do="Pass them in this order, or as a dict.",
             names=names,
             what=what,
+            t=t,
         )
     return numbers

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import field, fields, replace
 from functools import cached_property
-from math import prod
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -14,8 +12,8 @@ from servoctl.checks import ON_SAMPLE, as_list, finite, interval, mapping, named
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.matrices import riccati
+from servoctl.control import conditions
 from servoctl.control.close import require_names
-from servoctl.control.conditions import ranges
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, of_plan, require_plant
@@ -38,22 +36,8 @@ MET = 1e-7  # of an input's size: distance from a limit at which it is met
 GIVEN_WAY = 1e-6  # of a residual's largest effect: least slack that counts
 STEPS = 100  # of the active-set method, which needs about as many as constraints become active
 WITHIN = 1e-10  # of an input's size, and of the terms of a limit: its admissible violation
-OPEN = 1e300  # stands for infinity in a schedule, which is finite
 DEPENDENT = 1e-9  # sine of the angle between a constraint and others, below which it depends on them
 SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # arguments of `fastest` for a scene
-
-
-class Layout:
-    """Named parts of a vector, in this order; matrices row by row."""
-
-    def __init__(self, **shapes):
-        shapes = {name: (shape,) if isinstance(shape, int) else shape for name, shape in shapes.items()}
-        ends = np.cumsum([0, *(prod(shape) for shape in shapes.values())]).tolist()
-        self._parts = [(name, slice(*ends[i : i + 2]), shape) for i, (name, shape) in enumerate(shapes.items())]
-
-    def split(self, vector):
-        """The parts by name, as attributes."""
-        return SimpleNamespace(**{name: vector[part].reshape(shape) for name, part, shape in self._parts})
 
 
 class Effects:
@@ -86,31 +70,6 @@ class Effects:
         j, m = len(self.names), len(self._plant.inputs)
         y = self._function(t, x, self._plant.parameters)
         return y[:j], y[j:].reshape(m, j).T
-
-
-class SmallQP:
-    """min xᵀH x/2 of n unknowns subject to low <= x <= high and least <= A x <= most, by DAQP through CasADi."""
-
-    def __init__(self, n, rows):
-        shapes = {"h": ca.Sparsity.dense(n, n), "a": ca.Sparsity.dense(rows, n)}
-        self._solve = ca.conic("qp", "daqp", shapes, {"error_on_fail": False})
-        self._g, self._sizes = np.zeros(n), (n, rows)
-
-    def __reduce__(self):
-        return SmallQP, self._sizes
-
-    def __call__(self, H, low, high, A, least, most):
-        """The solution (n,), or None if there is none."""
-        try:
-            solution = self._solve(h=H, g=self._g, a=A, lba=least, uba=most, lbx=low, ubx=high)
-        except RuntimeError as error:  # CasADi's only type
-            raise ServoError(
-                f"The quadratic program of the allocation failed: {str(error).splitlines()[0][:100]}.",
-                "Its data are finite numbers.",
-                do="Check weights and limits for very large numbers.",
-                size=self._sizes,
-            ) from error
-        return np.asarray(solution["x"]).ravel() if self._solve.stats()["success"] else None
 
 
 def limited(
@@ -168,17 +127,17 @@ def limited(
     _require_law(law, plant)
     effects, bounds = _bounds(plant, bounds)
     reference = Reference(law.plan, plant, law.rate)
-    residuals, D, at_once = _predicted(reference, positive("horizon", horizon))
-    H = _metric(reference, residuals, _weights(residuals, weights, priority), at_once)
+    weights = _weights(tuple(program_residuals(law.plan.model)), weights, priority)
+    D, H = _predicted(reference, positive("horizon", horizon), weights)
     sizes = _sizes(law.plan, plant, H)
-    allocation = Allocation(law, plant, effects, bounds, residuals, sizes, np.abs(D).max(axis=0) @ sizes)
-    low, high, change = ranges(plant, law.period)
-    numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])
+    allocation = Allocation(law, plant, effects, bounds, tuple(weights), sizes, np.abs(D).max(axis=0) @ sizes)
+    low, high, change = conditions.limits(plant, law.period)
+    numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])  # finite in a schedule
     return replace(
         law,
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
         step=allocation,
-        schedule=_schedule(law, reference, D, H, _finite(numbers)),
+        schedule=_schedule(law, reference, D, H, np.nan_to_num(numbers)),
         state=np.concatenate([law.state, np.clip(law.initial_input, low, high)]),
         state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
         signals=(*law.signals, *allocation.signals),
@@ -235,11 +194,6 @@ def _schedule(law, reference, D, H, numbers):
     return np.vstack([part[:, np.minimum(samples, part.shape[1] - 1)] for part in parts])
 
 
-def _finite(numbers):
-    """Numbers within the range of a schedule."""
-    return np.clip(numbers, -OPEN, OPEN)
-
-
 def _require_law(law, plant):
     """Refuse anything but a law without allocation that has a plan, starts with it and has the names of the plant."""
     require_plant(plant)
@@ -268,14 +222,31 @@ def _require_law(law, plant):
         )
 
 
-def _predicted(reference, horizon):
-    """Names of residuals, their deviation after the horizon per unit of input (N, k, m), immediate effects by name."""
+def _predicted(reference, horizon, weights):
+    """Deviations D of residuals after the horizon per unit of input, (N, k, m), and costs H of the inputs, (N, m, m).
+
+    `weights` w_i by residual; H = R + BᵀPB along the plan, with P the cost-to-go of Σ w_i φ_i².
+    """
+    plant, residuals = reference.plant, Residuals(reference.plan.model, reference.plant)
+    (A, B), C = reference.linearised(), residuals.jacobian(reference.t, reference.x)
+    D = dict(zip(residuals.names, np.moveaxis(C @ discretised(A, B, horizon)[1], 1, 0), strict=True))
+    A, B = discretised(A, B, reference.period)
+    w = Q_POSITION * np.array([weights[name] for name in residuals.names])
+    Q = np.einsum("nki,k,nkj->nij", C, w, C) + UNSEEN * Q_POSITION * np.eye(plant.n_x)
+    R, basis = R_INPUT * np.eye(len(plant.inputs)), tangents(reference)
+    _, P = steady(A[-1:], B[-1:], Q[-1], R, basis[-1:])
+    H = riccati(A[::-1], B[::-1], Q[::-1], R, P)[1][::-1]
+    for name, O in _at_once(reference, residuals.names).items():
+        D[name] = O
+        H += Q_POSITION * weights[name] * np.einsum("ni,nj->nij", O, O)
+    return np.stack([D[name] for name in weights], axis=1), H
+
+
+def _at_once(reference, others):
+    """Immediate effects of the inputs on residuals of order 2 along the plan, (N, m) by name; not of `others`."""
     plan, plant = reference.plan, reference.plant
     program, q = program_residuals(plan.model), plan.model.reduction.mechanism.q
-    residuals = Residuals(plan.model, plant)
-    _, B = discretised(*reference.linearised(), horizon)
-    D = dict(zip(residuals.names, np.moveaxis(residuals.jacobian(reference.t, reference.x) @ B, 1, 0), strict=True))
-    second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in D}
+    second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in others}
     for name in second:
         if (order := q.order(program[name])) > 2:
             raise SpecificationError(
@@ -287,25 +258,7 @@ def _predicted(reference, horizon):
             )
     effects = Effects(plant, second)
     slopes = np.array([effects(t, x)[1] for t, x in zip(reference.t, reference.x.T, strict=True)])
-    at_once = {name: slopes[:, i] for i, name in enumerate(second)}
-    names = tuple(program)
-    return names, np.stack([(D | at_once)[name] for name in names], axis=1), at_once
-
-
-def _metric(reference, names, weights, at_once):
-    """R + BᵀPB along the plan, P the cost-to-go of Σ w_i φ_i², (N, m, m)."""
-    plant = reference.plant
-    residuals = Residuals(reference.plan.model, plant)
-    A, B = discretised(*reference.linearised(), reference.period)
-    C = residuals.jacobian(reference.t, reference.x)
-    w = Q_POSITION * np.array([weights[names.index(name)] for name in residuals.names])
-    Q = np.einsum("nki,k,nkj->nij", C, w, C) + UNSEEN * Q_POSITION * np.eye(plant.n_x)
-    R, basis = R_INPUT * np.eye(len(plant.inputs)), tangents(reference)
-    _, P = steady(A[-1:], B[-1:], Q[-1], R, None if basis is None else basis[-1:])
-    H = riccati(A[::-1], B[::-1], Q[::-1], R, P)[1][::-1]
-    for name, O in at_once.items():
-        H += Q_POSITION * weights[names.index(name)] * np.einsum("ni,nj->nij", O, O)
-    return H
+    return {name: slopes[:, i] for i, name in enumerate(second)}
 
 
 @frozen(eq=False)
@@ -339,17 +292,6 @@ class Allocation(Value):
         return (*(f"slack {name}" for name in self.residuals), *(f"{kind} {name}" for kind, name in self.limits))
 
     @cached_property
-    def _layouts(self):
-        """Layouts of the arguments x and column, and of the law's output."""
-        law, m, k, n_z = self.law, len(self.sizes), len(self.residuals), len(self.law.state)
-        for_c = 4 * m + self.bounds.size + len(self.plant.parameters) + (n_z * m if law.input_matrix is not None else 0)
-        return (
-            Layout(y=len(law.measures), z=n_z, last=m),
-            Layout(column=law.schedule.shape[0], for_c=for_c, x_ref=self.plant.n_x, D=(k, m), H=(m, m)),
-            Layout(u=m, z=n_z, signals=len(law.signals)),
-        )
-
-    @cached_property
     def measured(self):
         """Indices of the measured states."""
         return [self.plant.state_names.index(name) for name in self.law.measures]
@@ -357,11 +299,14 @@ class Allocation(Value):
     @cached_property
     def _limits(self):
         """Lower and upper limits, and the largest change in a sample, (m,) each."""
-        return ranges(self.plant, self.law.period)
+        return conditions.limits(self.plant, self.law.period)
 
     @cached_property
     def _qp(self):
-        return SmallQP(len(self.sizes), len(self.bounds))
+        """min vᵀH v/2 subject to lbx <= v <= ubx and lba <= A v <= uba, by DAQP through CasADi."""
+        m, j = len(self.sizes), len(self.bounds)
+        shapes = {"h": ca.Sparsity.dense(m, m), "a": ca.Sparsity.dense(j, m)}
+        return ca.conic("qp", "daqp", shapes, {"error_on_fail": False})
 
     def native(self, suffix):
         """The same in C, `NAME_suffix`; None without a compiler, or for a law in Python."""
@@ -407,29 +352,31 @@ class Allocation(Value):
 
     def __call__(self, t, x, column):
         """The inputs, the next controller state and the signals, in one array."""
-        of_x, of_column, of_output = self._layouts
-        now, along = of_x.split(x), of_column.split(column)
-        desired = of_output.split(self.law.answer(t, np.concatenate([now.y, now.z]), along.column))
-        state = along.x_ref.copy()
-        state[self.measured] = now.y
+        law, n_x, m, k = self.law, self.plant.n_x, len(self.sizes), len(self.residuals)
+        y, z, last = np.split(x, np.cumsum([len(law.measures), len(law.state)]))
+        answer = law.answer(t, np.concatenate([y, z]), column[: len(law.schedule)])
+        desired, z_next, signals = np.split(answer, [m, m + len(law.state)])
+        state, D, H = np.split(column[-(n_x + k * m + m * m) :].copy(), [n_x, n_x + k * m])
+        D, H = D.reshape(k, m), H.reshape(m, m)
+        state[self.measured] = y
         low, high, change = self._limits
-        low, high = np.maximum(low, now.last - change), np.minimum(high, now.last + change)
+        low, high = np.maximum(low, last - change), np.minimum(high, last + change)
         c, O = self.effects(t, state)
-        u = self._allocate(t, desired.u, low, high, along.H, c, O)
-        difference = u - desired.u
-        slack = along.D @ difference
-        gives_way = np.any(np.abs(slack) > GIVEN_WAY * (np.abs(along.D) @ self.sizes))
-        z = self._advanced(t, now.z, desired.z, gives_way, difference)
+        u = self._allocate(t, desired, low, high, H, c, O)
+        difference = u - desired
+        slack = D @ difference
+        gives_way = np.any(np.abs(slack) > GIVEN_WAY * (np.abs(D) @ self.sizes))
+        z = self._advanced(t, z, z_next, gives_way, difference)
         room = MET * self.sizes
         active = np.where(u <= low + room, -1.0, np.where(u >= high - room, 1.0, 0.0)) * (np.abs(difference) > room)
         reached = np.where(np.abs(c + O @ u - self.bounds.T) <= MET * (np.abs(O) @ self.sizes), [[-1.0], [1.0]], 0.0)
-        return np.concatenate([u, z, u, desired.signals, slack, active, reached.sum(axis=0)])
+        return np.concatenate([u, z, u, signals, slack, active, reached.sum(axis=0)])
 
     def _advanced(self, t, z, z_next, gives_way, difference):
         """The next controller state: integrals are held while there is slack, an estimate takes the inputs that act."""
-        law, z_next = self.law, z_next.copy()
-        if gives_way and law.integrators:
-            z_next[list(law.integrators)] = z[list(law.integrators)]
+        law, held = self.law, list(self.law.integrators) if gives_way else []
+        z_next = z_next.copy()
+        z_next[held] = z[held]
         if law.input_matrix is None:
             return z_next
         k = min(round((t - law.t0) * law.rate), len(law.input_matrix) - 1)
@@ -443,12 +390,20 @@ class Allocation(Value):
         S, A = np.diag(self.sizes), O * self.sizes
         # rows are scaled to entries of order one, for the tolerance of the solver
         scale = np.maximum(np.abs(A).max(axis=1, initial=0.0), TINY)
-        H = S @ H @ S
-        ends = (low - desired) / self.sizes, (high - desired) / self.sizes
-        v = self._qp(H / np.abs(H).max(), *ends, A / scale[:, None], least / scale, most / scale)
-        if v is None:
+        H, A = S @ H @ S, A / scale[:, None]
+        sides = {"lbx": (low - desired) / self.sizes, "ubx": (high - desired) / self.sizes}
+        sides |= {"lba": least / scale, "uba": most / scale}
+        try:
+            v = self._qp(h=H / np.abs(H).max(), a=A, **sides)["x"]
+        except RuntimeError as error:  # CasADi's only type
+            raise ServoError(
+                f"The quadratic program of the allocation failed: {str(error).splitlines()[0][:100]}.",
+                "Its data are finite numbers.",
+                do="Check weights and limits for very large numbers.",
+            ) from error
+        if not self._qp.stats()["success"]:
             raise self._infeasible(t, low, high)
-        return np.clip(desired + self.sizes * v, low, high)
+        return np.clip(desired + self.sizes * np.asarray(v).ravel(), low, high)
 
     def _infeasible(self, t, low, high):
         names = self.plant.inputs
@@ -466,11 +421,11 @@ class Allocation(Value):
 
 
 def _weights(names, weights, priority):
-    """The residuals' weights, (k,)."""
+    """The residuals' weights by name."""
     weights = numbers_by_name(weights, names, "residual", "weight", positive=True)
     order = [] if priority is None else as_list(priority)
     if order == []:
-        return np.array([weights.get(name, 1.0) for name in names])
+        return {name: weights.get(name, 1.0) for name in names}
     if order is None or not all(isinstance(name, str) for name in order) or len({*order}) < len(order):
         raise SpecificationError(
             f"The priority is {repr(priority)[:150]}.",
@@ -489,12 +444,12 @@ def _weights(names, weights, priority):
     for name in order:
         named(name, names, "residual")
     order += [name for name in names if name not in order]
-    return np.array([FALLING ** order.index(name) for name in names])
+    return {name: FALLING ** order.index(name) for name in names}
 
 
 def _sizes(plan, plant, H):
     """A typical size of each input, (m,): the width of its limits, else its largest value in the plan."""
-    low, high, _ = ranges(plant, 1.0)
+    low, high, _ = conditions.limits(plant, 1.0)
     used = np.array([np.abs(plan[name]).max() for name in plant.inputs])
     sizes = np.where(np.isfinite(high - low), high - low, used)
     unit = 1 / np.sqrt(np.diagonal(H, axis1=1, axis2=2).max(axis=0))  # inputs of equal cost

@@ -37,14 +37,14 @@ class Loop(Value):
     measured: np.ndarray  # (n_y,) indices of states
     disturbed: np.ndarray  # (n_d,) indices in p of generalised forces and parameters
     initial_input: np.ndarray  # (n_u,) until the first command arrives
+    low: np.ndarray  # (n_u,) limits of the inputs, infinite without any
+    high: np.ndarray
+    change: np.ndarray  # (n_u,) largest change of the inputs from sample to sample
     disturbance: np.ndarray = None  # (n_parts, 3, n_d) at the start, the middle and the end of each part of a step
     parts: np.ndarray = None  # (samples * substeps + 1,) first part of each step; None: each has one, all of it
     spans: np.ndarray = None  # (n_parts, 2) begin of a part after that of its step, and its length [s]
     noise: np.ndarray = None  # (samples + 1, n_y)
     quantum: np.ndarray = None  # (n_y,)
-    low: np.ndarray = None  # (n_u,) limits of the inputs
-    high: np.ndarray = None
-    change: np.ndarray = None  # (n_u,) largest change of the inputs from sample to sample
     transport: np.ndarray = None  # (n_u,) integration steps by which each input arrives late
 
 
@@ -189,8 +189,7 @@ def quantised(y, quantum):
 
 def limited(command, before, low, high, change):
     """Inputs (n_u,) of one sample: the command clipped to its limits, then to the largest change per sample."""
-    u = command if low is None else np.clip(command, low, high)
-    return u if change is None else np.clip(u, before - change, before + change)
+    return np.clip(np.clip(command, low, high), before - change, before + change)
 
 
 def samples_ago(step, transport, substeps):

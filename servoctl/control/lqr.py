@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, numbers_by_name, rows_read
 from servoctl.codegen.matrices import riccati
-from servoctl.control.feedback import StateFeedback, affine
+from servoctl.control.feedback import StateFeedback, affine, integral_names
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, of_plan, refuse_transport
 from servoctl.control.residuals import Residuals, program_residuals
@@ -92,19 +92,19 @@ def lqr(
     plant = of_plan(plan, plant)
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The design is")
-    Q = weights(Q, _state_weights(plant), plant.state_names, "state", "Q")
+    Q = weights(Q, by_level(plant, Q_POSITION, Q_VELOCITY), plant.state_names, "state", "Q")
     R = weights(R, np.full(len(plant.inputs), R_INPUT), plant.inputs, "actuator", "R", positive=True)
     residuals, Q_i = _integrals(integral, plan, plant)
     A, B = discretised(*reference.linearised(), reference.period)
     augmented = _with_integrals(A, B, Q, residuals, Q_i, reference) if residuals else (A, B, Q)
-    basis = tangents(reference, 0 if residuals is None else len(Q_i))
-    names = (*plant.state_names, *(f"integral of {name}" for name in (residuals.names if residuals else ())))
+    integrated = residuals.names if residuals else ()
+    basis = tangents(reference, len(integrated))
+    names = (*plant.state_names, *integral_names(integrated))
     try:
         K = _varying(*augmented, R, basis) if varying else steady(*augmented, R, basis)[0]
     except ServoError as error:
         raise _explained(error, augmented, basis, names, plant, varying) from None
     K_x, K_i = np.split(K, [plant.n_x], axis=2)
-    integrated = residuals.names if residuals else ()
     how = f"lqr, {'time-varying' if varying else 'frozen-time'}" + (", with integrals" if residuals else "")
     known = {"gains": K, "Q": augmented[2], "R": R, "integrated": integrated, "states": plant.state_names}
     info = Deferred(known, (LARGEST_RADIUS, LAST_RADIUS), partial(_radii, augmented[:2], K, basis))
@@ -115,14 +115,14 @@ def lqr(
 def _radii(plant, K, basis):
     """The largest and the last spectral radius of the sampled error dynamics; an eigenvalue problem at each sample."""
     A, B = plant
-    radii = spectral_radii(_reduced(A - B @ K, basis))
+    radii = spectral_radii(reduced(A - B @ K, basis))
     return {LARGEST_RADIUS: float(radii.max()), LAST_RADIUS: float(radii[-1])}
 
 
-def _state_weights(plant):
-    """The default diagonal of Q: coordinates, velocities, and 0 for lagged inputs."""
+def by_level(plant, of_coordinates, of_velocities):
+    """A diagonal for the states: a number for coordinates, one for velocities, and 0 for lagged inputs."""
     q, diagonal = plant.mechanism.q, np.zeros(plant.n_x)
-    diagonal[: q.nq + q.n] = [Q_POSITION] * q.nq + [Q_VELOCITY] * q.n
+    diagonal[: q.nq + q.n] = [of_coordinates] * q.nq + [of_velocities] * q.n
     return diagonal
 
 
@@ -137,33 +137,32 @@ def _with_integrals(A, B, Q, residuals, Q_i, reference):
 
 
 def tangents(reference, extra=0):
-    """Orthonormal bases of the tangent spaces of material constraints, (N, n, r); None without constraints."""
-    plant = reference.plant
-    if not plant.constrained:
-        return None
-    y = plant.function("constraints_jacobian").grid(reference.t, reference.x, plant.p())
-    J = y.reshape(plant.n_x, -1, len(reference.t)).transpose(2, 1, 0)
-    rank = int(np.linalg.matrix_rank(J[0], tol=1e-9 * np.abs(J[0]).max()))
-    T = np.linalg.svd(J)[2][:, rank:].transpose(0, 2, 1)
-    n, r = T.shape[1:]
-    bases = np.zeros((len(T), n + extra, r + extra))
+    """Orthonormal bases of the tangent spaces of material constraints, (N, n, r); the identity without any."""
+    plant, count = reference.plant, len(reference.t)
+    T = np.eye(plant.n_x)
+    if plant.constrained:
+        y = plant.function("constraints_jacobian").grid(reference.t, reference.x, plant.p())
+        J = y.reshape(plant.n_x, -1, count).transpose(2, 1, 0)
+        rank = int(np.linalg.matrix_rank(J[0], tol=1e-9 * np.abs(J[0]).max()))
+        T = np.linalg.svd(J)[2][:, rank:].transpose(0, 2, 1)
+    n, r = T.shape[-2:]
+    bases = np.zeros((count, n + extra, r + extra))
     bases[:, :n, :r], bases[:, n:, r:] = T, np.eye(extra)
     return bases
 
 
-def _reduced(A, basis):
-    """TᵀAT: error dynamics on the tangent space."""
-    return A if basis is None else basis.swapaxes(1, 2) @ A @ basis
+def reduced(A, T):
+    """TᵀAT: error dynamics on the tangent spaces."""
+    return T.swapaxes(1, 2) @ A @ T
 
 
-def steady(A, B, Q, R, basis):
+def steady(A, B, Q, R, T):
     """K (N, m, n) of the steady Riccati equation at each sample, and the last P (n, n).
 
     The structure-preserving doubling algorithm (Chu, Fan, Lin, Wang 2004) for all samples at once: step k is the
-    solution of a horizon of 2^k samples. A, B are (N, n, n), (N, n, m); Q, R are (n, n), (m, m); the basis of the
-    tangent spaces is (N, n, r) or None.
+    solution of a horizon of 2^k samples. A, B are (N, n, n), (N, n, m); Q, R are (n, n), (m, m); bases T of the
+    tangent spaces are (N, n, r).
     """
-    T = np.eye(A.shape[1])[None] if basis is None else basis
     left = T.swapaxes(1, 2)
     A, B, eye = left @ A @ T, left @ B, np.eye(T.shape[2])
     a, G, P = A, B @ np.linalg.solve(R, B.swapaxes(1, 2)), np.broadcast_to(left @ Q @ T, A.shape)
@@ -191,17 +190,15 @@ def _explained(error, augmented, basis, names, plant, varying):
     """The error of a Riccati equation without a solution, with the mode that inputs do not reach or weights not see."""
     A, B, Q = augmented
     some = np.unique(np.linspace(0, len(A) - 1, COMPARED).round().astype(int))
-    bases = [np.eye(A.shape[1]) if basis is None else basis[k] for k in some]
-    mode = _conserved(A[some], B[some], bases, plant.mechanism.q.nq)
-    if mode:
-        moves = np.abs(A[some] - np.eye(len(Q))).max(axis=(0, 1))
-        alone = [names[i] for i in mode if moves[i] < UNREACHED and (Q[i, i] > 0 or not varying)]
-        return _beyond_inputs(error, [names[i] for i in mode], alone, plant, varying)
-    k, T = some[-1], bases[-1]
-    a = T.T @ A[k] @ T
-    unreached, unseen = _fixed_modes(a, B[k].T @ T), _fixed_modes(a.T, Q @ T)
+    T = basis[-1]
+    a = T.T @ A[-1] @ T
+    unreached, unseen = _conserved(A[some], B[some], basis[some]), _fixed_modes(a.T, Q @ T)
+    unreached = unreached if unreached.size else T @ _fixed_modes(a, B[-1].T @ T)
     if unreached.size:
-        return _beyond_inputs(error, _states_in(T @ unreached, names), [], plant, varying)
+        mode, moves = _states_in(unreached, names), np.abs(A[some] - np.eye(len(Q))).max(axis=(0, 1))
+        weighs = np.diag(Q) > 0 if varying else np.ones(len(Q), dtype=bool)
+        alone = [n for n, m, w in zip(names, moves, weighs, strict=True) if n in mode and m < UNREACHED and w]
+        return _beyond_inputs(error, mode, alone, plant, varying)
     if unseen.size:
         mode = _states_in(T @ unseen, names)
         return ServoError(
@@ -213,25 +210,15 @@ def _explained(error, augmented, basis, names, plant, varying):
     return error
 
 
-def _conserved(A, B, bases, nq):
-    """Places of the fewest states of which a combination c, the same at all samples, is conserved; [] if none is.
+def _conserved(A, B, T):
+    """Combinations c of states, (n, number), that no sample and no input changes: cᵀ(A - 1)T = 0 and cᵀB = 0 at all.
 
-    On the tangent spaces, no sample and no input changes it: cᵀ(A - 1)T = 0 and cᵀB = 0 at all samples. Velocities and
-    integrals are left out first, then coordinates that move others, as long as a combination remains.
+    The combinations are those of the tangent spaces T.
     """
-    eye = np.eye(A.shape[1])
-    changes = [(a - eye) @ T for a, T in zip(A, bases, strict=True)]
-    conditions = np.hstack([*changes, *(B / max(np.abs(B).max(), 1e-300))]).T
-    moves = np.abs(A - eye).max(axis=(0, 1))
-    support = list(range(len(eye)))
-    combinations = _null_space(conditions)
-    for i in sorted(support, key=lambda i: (i < nq, moves[i] < UNREACHED)):
-        fewer = [j for j in support if j != i]
-        null = _null_space(conditions[:, fewer])
-        if null.size and max(np.abs(T[fewer].T @ null).max() for T in bases) > NAMED:
-            support, combinations = fewer, null
-    left = combinations.size and max(np.abs(T[support].T @ combinations).max() for T in bases) > NAMED
-    return support if left else []
+    changes = (A - np.eye(A.shape[1])) @ T
+    null = _null_space(np.hstack([*changes, *(B / max(np.abs(B).max(), 1e-300))]).T)
+    _, sizes, rows = np.linalg.svd(np.vstack(T.swapaxes(1, 2) @ null))
+    return null @ rows[sizes > NAMED].T
 
 
 def _null_space(matrix):
@@ -280,12 +267,11 @@ def _varying(A, B, Q, R, basis):
     """
     Q = np.broadcast_to(Q, A.shape)
     try:
-        K, P = steady(A[-1:], B[-1:], Q[-1], R, None if basis is None else basis[-1:])
+        K, P = steady(A[-1:], B[-1:], Q[-1], R, basis[-1:])
     except ServoError:
         gains, _, P = riccati(np.broadcast_to(A[-1], A.shape), np.broadcast_to(B[-1], B.shape), Q, R, Q[-1])
         K = gains[-1:]
-        last = _reduced(A[-1:] - B[-1:] @ K, None if basis is None else basis[-1:])
-        if not spectral_radii(last)[0] < MARGINAL:
+        if not spectral_radii(reduced(A[-1:] - B[-1:] @ K, basis[-1:]))[0] < MARGINAL:
             raise
     backwards = slice(-2, None, -1)
     before, _, _ = riccati(A[backwards], B[backwards], Q[backwards], R, P)

@@ -24,20 +24,17 @@ def key(seed):
 def normal(seed, count, channels):
     """Standard normal numbers of some channels, (count, len(channels))."""
     y = np.empty((count, len(channels)))
-    library = _library(compiler.lanes(), compiler.compiler())
-    for column, channel in enumerate(channels):
-        if library is None:
-            y[:, column] = _by_numpy(seed, channel, count)
-        else:
-            place = ctypes.c_void_p(y.ctypes.data + column * y.itemsize)
-            sizes = map(ctypes.c_int64, (channel, count, len(channels)))
-            library.normal(pointer(key(seed)), *sizes, place)
+    for column, channel in zip(y.T, channels, strict=True):
+        words = np.random.Philox(key=key(seed), counter=[0, channel, 0, 0]).random_raw(4 * -(-count // 4))
+        radial, angular = np.moveaxis((words >> np.uint64(11)).reshape(-1, 2, 2), 2, 0)
+        r, a = np.sqrt(-2.0 * np.log((radial + np.uint64(1)) * 2.0**-53)), angular * (2.0**-52 * np.pi)
+        column[:] = np.stack([r * np.cos(a), r * np.sin(a)], axis=-1).ravel()[:count]
     return y
 
 
 def first_words(seed, kind, count):
     """The first word of channels 0 .. count - 1 of a kind, (count,) uint64; noise is kind 0."""
-    y, library = np.empty(count, dtype=np.uint64), _library(compiler.lanes(), compiler.compiler())
+    y, library = np.empty(count, dtype=np.uint64), _library(compiler.compiler())
     if library is None:
         words = (np.random.Philox(key=key(seed), counter=[0, channel, kind, 0]) for channel in range(count))
         return np.array([word.random_raw() for word in words], dtype=np.uint64)
@@ -45,15 +42,7 @@ def first_words(seed, kind, count):
     return y
 
 
-def _by_numpy(seed, channel, count):
-    words = np.random.Philox(key=key(seed), counter=[0, channel, 0, 0]).random_raw(4 * -(-count // 4))
-    radial, angular = np.moveaxis((words >> np.uint64(11)).reshape(-1, 2, 2), 2, 0)
-    r, a = np.sqrt(-2.0 * np.log((radial + np.uint64(1)) * 2.0**-53)), angular * (2.0**-52 * np.pi)
-    return np.stack([r * np.cos(a), r * np.sin(a)], axis=-1).ravel()[:count]
-
-
 @cache
-def _library(lanes, _compiler):
-    """The compiled functions for a number of lanes and a compiler; None without one."""
-    text = f"#define W_LANES {lanes}\n{emit.unit({'NAME': 'normal'})}{emit.include('normal.c')}"
-    return compiler.library(text, level="-O3")
+def _library(_compiler):
+    """The compiled function for a compiler; None without one."""
+    return compiler.library(f"{emit.unit({'NAME': 'normal'})}{emit.include('normal.c')}", level="-O3")

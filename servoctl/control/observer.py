@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import numbers_by_name
 from servoctl.codegen.matrices import riccati
-from servoctl.control.feedback import integral_names, integration, law_step
+from servoctl.control.feedback import integral_names, integrating, integration, law_step
 from servoctl.control.law import Law
-from servoctl.control.lqr import tangents, weights
+from servoctl.control.lqr import by_level, reduced, tangents, weights
 from servoctl.control.reference import Reference, of_plan, refuse_transport, require_plant
 from servoctl.control.residuals import Residuals
 from servoctl.control.sampling import discretised, spectral_radii
@@ -39,13 +39,10 @@ def estimating_law(states, where, n_u, residuals=None):
     K, K_i, L, A, B = (matrix.T for matrix in symbols.values())
     corrected = estimate + L @ (y - x_ref[where] - estimate[where])
     du = -K @ corrected - K_i @ z
-    column = [u_ff, x_ref, *map(ca.vec, symbols.values())]
-    outputs = [u_ff + du, A @ corrected + B @ du]
-    if n_z:
-        period, p = ca.SX.sym("Ts"), ca.SX.sym("p", residuals.parameters.size)
-        column += [period, p]
-        outputs.append(z + period * residuals.expression(t, x_ref + corrected, states, p))
-    return law_step("estimating", t, ca.vertcat(y, estimate, z), ca.vertcat(*column), outputs)
+    further, z_next = integrating(residuals, t, x_ref + corrected, states, z)
+    column = ca.vertcat(u_ff, x_ref, *map(ca.vec, symbols.values()), *further)
+    outputs = [u_ff + du, A @ corrected + B @ du, *z_next]
+    return law_step("estimating", t, ca.vertcat(y, estimate, z), column, outputs)
 
 
 def output_feedback(
@@ -92,12 +89,14 @@ def output_feedback(
     measured, deviations = _deviations(noise, plant)
     reference, gains = Reference(law.plan, plant, law.rate), law.feedback
     basis = tangents(reference)
-    A, B = _onto(basis, *discretised(*reference.linearised(), reference.period))
+    after = basis[np.minimum(np.arange(len(basis)) + 1, len(basis) - 1)]  # at the next sample
+    A, B = (after @ (after.swapaxes(1, 2) @ X) for X in discretised(*reference.linearised(), reference.period))
     n_x, n_z = plant.n_x, len(gains.residuals)
-    W = weights(process, _process_noise(plant), plant.state_names, "state", "process") * reference.period
+    intensity = by_level(plant, POSITION_NOISE**2, VELOCITY_NOISE**2)
+    W = weights(process, intensity, plant.state_names, "state", "process") * reference.period
     where = [plant.state_names.index(name) for name in measured]
     C = np.eye(n_x)[where]
-    L = _filter(A, C, W, np.diag(deviations**2), basis)
+    L = _filter(A, C, W, np.diag(deviations**2), basis, after)
     residuals = Residuals(law.plan.model, plant, gains.residuals) if n_z else None
     schedule = [reference.inputs(), reference.x]
     schedule += [part.reshape(len(A), -1).T for part in (gains.K, gains.K_i, L, A, B)]  # row by row
@@ -124,18 +123,8 @@ def output_feedback(
 
 def _info(law, A, LC, basis):
     """The results of a law's design, and the largest spectral radius of the filter's errors."""
-    errors = A @ (np.eye(A.shape[1]) - LC)
-    errors = errors if basis is None else basis.swapaxes(1, 2) @ errors @ basis
+    errors = reduced(A @ (np.eye(A.shape[1]) - LC), basis)
     return law.info | {FILTER_RADIUS: float(spectral_radii(errors).max())}
-
-
-def _process_noise(plant):
-    """The default intensity by state; 0 for lagged inputs."""
-    n_x, lagged, n = plant.n_x, len(plant.lag), len(plant.disturbable)
-    intensity = np.zeros(n_x)
-    intensity[: n_x - lagged] = POSITION_NOISE**2
-    intensity[n_x - lagged - n : n_x - lagged] = VELOCITY_NOISE**2
-    return intensity
 
 
 def _require_lqr(law, plant):
@@ -159,14 +148,6 @@ def _require_lqr(law, plant):
     refuse_transport(plant, "The prediction is")
 
 
-def _onto(basis, A, B):
-    """A and B, projected onto the tangent space of the material constraints at the next sample."""
-    if basis is None:
-        return A, B
-    T = basis[np.minimum(np.arange(len(A)) + 1, len(A) - 1)]
-    return T @ (T.swapaxes(1, 2) @ A), T @ (T.swapaxes(1, 2) @ B)
-
-
 def _deviations(noise, plant):
     """Names of the measured states, and the standard deviations of their noise, (n_y,)."""
     deviations = numbers_by_name(noise, plant.state_names, "state of the plant", "standard deviation", positive=True)
@@ -180,18 +161,12 @@ def _deviations(noise, plant):
     return tuple(deviations), np.array(list(deviations.values()))
 
 
-def _filter(A, C, W, V, basis):
+def _filter(A, C, W, V, basis, after):
     """Gains L (N, n_x, n_y) of the filter along the plan; covariances are in the basis of each sample."""
     from scipy.linalg import solve_discrete_are
 
-    count = len(A)
-    if basis is None:
-        moved, seen, gathered = A, np.broadcast_to(C, (count, *C.shape)), np.broadcast_to(W, A.shape)
-        A_0, W_0 = A[0], W
-    else:
-        after = basis[np.minimum(np.arange(count) + 1, count - 1)].swapaxes(1, 2)
-        moved, seen, gathered = after @ A @ basis, C @ basis, after @ W @ after.swapaxes(1, 2)
-        A_0, W_0 = (basis[0].T @ part @ basis[0] for part in (A[0], W))
+    moved, seen, gathered = after.swapaxes(1, 2) @ A @ basis, C @ basis, reduced(W, after)
+    A_0, W_0 = (basis[0].T @ part @ basis[0] for part in (A[0], W))
     try:
         P = solve_discrete_are(A_0.T, seen[0].T, W_0, V)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -202,4 +177,4 @@ def _filter(A, C, W, V, basis):
             measured=len(C),
         ) from error
     gains, _, _ = riccati(moved.swapaxes(1, 2), seen.swapaxes(1, 2), gathered, V, P, of_state=False)
-    return gains.swapaxes(1, 2) if basis is None else basis @ gains.swapaxes(1, 2)
+    return basis @ gains.swapaxes(1, 2)

@@ -5,7 +5,7 @@ from math import factorial, perm
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, named, positive, require_memory
+from servoctl.checks import ON_SAMPLE, named, positive, require_kind, require_memory
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
 from servoctl.plants.plant import Plant, part_of
 
@@ -94,9 +94,9 @@ class Reference:
         A, B = self.plant.linearised(self.middle, self.middle_x, self.middle_input)
         lost = _lost(A, B)
         if lost.any() and self.plant.constrained:
-            k, at = int(np.argmax(lost)), (self.middle, self.middle_x, self.middle_input)
+            k = int(np.argmax(lost))
             other = self.plant.near(float(self.middle[k]), self.middle_x[:, k])
-            A[lost], B[lost] = other.linearised(at[0][lost], at[1][:, lost], at[2][:, lost])
+            A[lost], B[lost] = other.linearised(self.middle[lost], self.middle_x[:, lost], self.middle_input[:, lost])
             lost = _lost(A, B)
         if lost.any():
             raise ServoError(
@@ -115,13 +115,7 @@ def _lost(A, B):
 
 def require_plant(plant):
     """Refuse anything but a Plant."""
-    if not isinstance(plant, Plant):
-        raise SpecificationError(
-            f"Expected a Plant, got a {type(plant).__name__}.",
-            "Laws are designed for plants, and loops are closed around them.",
-            do="Make the plant of the mechanism: sv.plant(mechanism).",
-            kind=type(plant).__name__,
-        )
+    require_kind(Plant, "plant", plant, "sv.plant(mechanism)")
 
 
 def of_plan(plan, plant):

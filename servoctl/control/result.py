@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from servoctl.checks import ON_SAMPLE, finite
+from servoctl.checks import ON_SAMPLE
 from servoctl.control.conditions import Conditions
-from servoctl.control.law import Law, UserStep
-from servoctl.control.loop import Loop
+from servoctl.control.law import Law, UserStep, sample_at
+from servoctl.control.loop import Loop, samples_ago
 from servoctl.control.reference import resampled
 from servoctl.control.residuals import known_residuals
 from servoctl.errors import SpecificationError
@@ -121,11 +121,11 @@ class Closed(Sampled, Value):
     @cached_property
     def p(self):
         """The plant's parameters, inputs after the transport delay, and disturbances at each sample, (n_p, N)."""
-        loop, inputs = self.loop, self.inputs.copy()
+        loop, inputs = self.loop, self.inputs
         if loop.transport is not None:
-            for a, late in enumerate(loop.transport):
-                sent = (np.arange(len(self.t)) * loop.substeps - late) // loop.substeps
-                inputs[a] = np.where(sent < 0, loop.initial_input[a], self.inputs[a, np.maximum(sent, 0)])
+            sent = np.arange(len(self.t)) - samples_ago(0, loop.transport[:, None], loop.substeps)
+            inputs = np.take_along_axis(inputs, np.maximum(sent, 0), axis=1)
+            inputs = np.where(sent < 0, loop.initial_input[:, None], inputs)
         p = self.plant.p(inputs)
         p[loop.disturbed] = self._disturbances
         return p
@@ -171,20 +171,13 @@ class Closed(Sampled, Value):
     @property
     def active(self) -> dict[str, np.ndarray]:
         """The limit that each input has met, (N,) by actuator: -1 lower, 1 upper, -2 and 2 of its rate, 0 none."""
-        loop, codes = self.loop, {}
-        k = np.arange(len(self.t)) - loop.delay
-        delayed = np.where(k < 0, loop.initial_input[:, None], self.commands[:, np.maximum(k, 0)])
-        before = np.column_stack([loop.initial_input, self.inputs[:, :-1]])
-        for a, name in enumerate(self.plant.inputs):
-            code, command = np.zeros(len(self.t), dtype=int), delayed[a]
-            if loop.low is not None:
-                code[command < loop.low[a]], code[command > loop.high[a]] = LOWER, UPPER
-                command = np.clip(command, loop.low[a], loop.high[a])
-            if loop.change is not None:
-                code[command > before[a] + loop.change[a]] = RISING
-                code[command < before[a] - loop.change[a]] = FALLING
-            codes[name] = code
-        return codes
+        loop, k = self.loop, np.arange(len(self.t)) - self.loop.delay
+        initial, low, high, change = (x[:, None] for x in (loop.initial_input, loop.low, loop.high, loop.change))
+        delayed = np.where(k < 0, initial, self.commands[:, np.maximum(k, 0)])
+        before, wanted = np.column_stack([initial, self.inputs[:, :-1]]), np.clip(delayed, low, high)
+        met = (wanted > before + change, wanted < before - change, delayed < low, delayed > high)
+        codes = np.select(met, (RISING, FALLING, LOWER, UPPER), NONE)
+        return dict(zip(self.plant.inputs, codes, strict=True))
 
     @cached_property
     def residual(self) -> Mapping[str, np.ndarray]:
@@ -240,18 +233,7 @@ class Closed(Sampled, Value):
         SpecificationError
             If t is between samples, or outside the run.
         """
-        t = finite("t", t, "time")
-        k = int(np.argmin(np.abs(self.t - t)))
-        if abs(self.t[k] - t) > ON_SAMPLE * self.loop.period:
-            raise SpecificationError(
-                f"t = {t:.9g} s is not a sample of the run.",
-                f"Its samples are {self.loop.period:g} s apart, from {self.t[0]:g} to {self.t[-1]:g} s.",
-                nearest=f"t = {self.t[k]:.9g} s.",
-                do="Pass a sampling instant, as of `run.t`.",
-                t=t,
-                nearest_t=float(self.t[k]),
-            )
-        return self.states[:, k].copy()
+        return self.states[:, sample_at(t, self.loop.t0, self.loop.period, len(self.t) - 1, "the run")].copy()
 
     @property
     def _counters(self):

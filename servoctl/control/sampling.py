@@ -1,13 +1,10 @@
 """Plants seen from sample to sample: exact discretisation under a zero-order hold, and the loops that it closes."""
 
-import math
-
 import numpy as np
 
 from servoctl.codegen import matrices as many
 
 SCALED, TERMS = 0.5, 16  # norm of a matrix whose exponential is summed; 0.5^17/17! is 2e-20
-ONE_NORM = 16  # times SCALED: a norm of which the powers are not worth computing
 IN_DOUBLE = 8  # squarings that leave 2^8 roundings of a double, 3e-14
 
 
@@ -24,41 +21,21 @@ def discretised(A, B, period):
 def exponentials(matrices):
     """exp of each matrix, (N, n, n): its Taylor series, scaled and squared, for all at once.
 
-    Balancing by powers of two removes the units of the entries, and ‖A⁴‖^¼ and ‖A⁵‖^⅕ stay near the spectral radius
-    where ‖A‖ does not (Al-Mohy and Higham 2009). Each squaring doubles the relative error of slow modes beside fast
-    ones; many of them are done in long doubles.
+    Balancing by powers of two removes the units of the entries. Each squaring doubles the relative error of slow modes
+    beside fast ones; many of them are done in long doubles.
     """
+    from scipy.linalg import matrix_balance
+
     sizes = np.maximum(matrices.max(axis=0, initial=0.0), -matrices.min(axis=0, initial=0.0))
-    units = balancing(sizes)
+    units = matrix_balance(np.nan_to_num(sizes), permute=False, separate=True)[1][0]
     scales = units[:, None] / units
-    norm = many.norms(matrices, scales)
-    if norm.max(initial=0.0) > ONE_NORM * SCALED:
-        balanced, ones = matrices / scales, np.ones(scales.shape)
-        fourth = np.linalg.matrix_power(balanced, 4)
-        norm = np.maximum(many.norms(fourth, ones) ** (1 / 4), many.norms(fourth @ balanced, ones) ** (1 / 5))
-    squarings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, SCALED) / SCALED))).astype(int)
+    norm = np.maximum(many.norms(matrices, scales), SCALED)
+    squarings = np.ceil(np.log2(norm / SCALED)).astype(int)
     result = many.exponentials(matrices, scales, squarings, TERMS)
     long = squarings > IN_DOUBLE
     if long.any():
         result[long] = many.squared((matrices[long] / scales).astype(np.longdouble), squarings[long], TERMS) * scales
     return result
-
-
-def balancing(sizes):
-    """Powers of two s (n,) with which rows and columns of A_ij s_j / s_i have similar norms (Parlett and Reinsch 1969).
-
-    `sizes` (n, n) are the magnitudes of A. Each change makes the sum of squares off the diagonal less.
-    """
-    A, scales, changed = sizes.copy(), np.ones(len(sizes)), True
-    while changed:
-        changed = False
-        for i in range(len(A)):
-            row, column = math.hypot(*A[i]), math.hypot(*A[:, i])
-            if 0.0 < column and 0.0 < row / column < math.inf and (power := round(math.log2(row / column) / 2)):
-                A[i] *= 2.0**-power
-                A[:, i] *= 2.0**power
-                scales[i], changed = scales[i] * 2.0**power, True
-    return scales
 
 
 def spectral_radii(matrices):

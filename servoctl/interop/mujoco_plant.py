@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from servoctl.checks import ON_SAMPLE, as_span, named, require_kind
-from servoctl.control.close import as_law, finished, loop_of, regular_at_start, require_names
+from servoctl.control.close import as_law, finished, loop_of, require_names
 from servoctl.control.conditions import Conditions
 from servoctl.control.reference import require_plant
 from servoctl.control.result import Closed
@@ -71,11 +71,10 @@ def mujoco(model, law, x0, t_span, *, plant=None, sensors=None, timing=None, dis
     for name in conditions.disturbance:
         named(name, plant.disturbable, "generalised force")  # MuJoCo does not have the plant's parameters
     machine = _Machine(library, model, plant)
-    plant = regular_at_start(plant, t_span[0], x0)
     timing = replace(conditions.timing, substeps=machine.steps(law.period))
     conditions = replace(conditions, timing=timing)
     try:
-        loop = loop_of(plant, law, x0, t_span, conditions)
+        plant, loop = loop_of(plant, law, x0, t_span, conditions)
         run = finished(plant, law, plan, loop, conditions, machine.hold)
     except ServoError as error:
         if error.run is not None:

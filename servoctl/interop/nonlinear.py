@@ -156,7 +156,7 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
     ode, low_high = plant.function("ode"), limits(plant, 1.0)[:2]
 
     def numbers(u, params):
-        applied, calm = limited(u[:m], None, *low_high, None), np.zeros(len(plant.disturbable))
+        applied, calm = np.clip(u[:m], *low_high), np.zeros(len(plant.disturbable))
         p = np.concatenate([_parameter_values(plant.parameters, symbols, params), applied, calm])
         p[places] = u[m:]
         return p
@@ -210,7 +210,7 @@ class _SampledPlant:
         m, n_x = self.m, self.plant.n_x
         x, queues = state[:n_x], state[n_x:].reshape(-1, m)
         commands, inputs = np.vstack([u[None, :m], queues[: self.delay]]), queues[self.delay :]
-        before = inputs[0] if len(inputs) else None
+        before = inputs[0] if len(inputs) else np.zeros(m)  # without limits of rate
         applied = limited(commands[self.delay], before, self.low, self.high, self.change)
         inputs = np.vstack([applied[None], inputs])
         ages = (samples_ago(s, self.late, self.substeps) for s in range(self.substeps))

@@ -1,14 +1,12 @@
 """A plant under inputs that are functions of time: a mechanism without a program."""
 
-from dataclasses import replace
-
 import casadi as ca
 
 from servoctl.checks import by_name, column
 from servoctl.errors import SpecificationError
 from servoctl.jets.overflow import settled
 from servoctl.model.model import derive
-from servoctl.plants.equations import plant_equations
+from servoctl.plants.plant import made_again
 from servoctl.spec.program import no_program
 
 
@@ -57,9 +55,4 @@ def _expression(name, value, t):
 
 def at_once(plant):
     """The plant with actuators that act at once, without limits."""
-    forces, damped, _, values = plant.equations.choices
-    count = len(plant.parameters) - len(plant.lag)
-    names = plant.state_names[: plant.n_x - len(plant.lag)]
-    equations = plant_equations(plant.mechanism, forces, damped, (), values) if plant.lag else plant.equations
-    numbers = {"parameters": plant.parameters[:count], "state_names": names, "equations": equations}
-    return replace(plant, limits={}, rate_limits={}, lag={}, delay={}, **numbers)
+    return made_again(plant, plant.mechanism)

@@ -8,16 +8,14 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.folding import folded
-from servoctl.codegen.function import compiled
 from servoctl.codegen.interpreted import Interpreter
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import cse, size_of_terms
+from servoctl.jets.branches import cse
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context, sample
 from servoctl.reduction.orders import Orders
-from servoctl.reduction.ranks import SUSPECT, alive, noting_dropped
 from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, strong
 from servoctl.reduction.rows import as_rows
 from servoctl.values import Identity
@@ -35,10 +33,12 @@ class PlantEquations:
     `others` are the same equations with pivots that were decided near states where these vanish.
     """
 
-    def __init__(self, mechanism, forces, damped, lagged, values=None):
+    def __init__(self, mechanism, forces, damped, lagged, values=None, context=None):
         q = self.q = mechanism.q
         self.mechanism, self.choices, self.lagged = mechanism, (forces, damped, lagged, values), lagged
         self.values = mechanism.parameters.values() if values is None else np.array(values)
+        parameters = mechanism.parameters.symbols
+        self._context = Context(parameters, self.values, WINDOW, {}) if context is None else context
         self.functions, self.others = {}, []
         self.forces = _expression(forces, mechanism)
         self.velocity = ca.vertcat(*q.gamma(1))
@@ -60,52 +60,20 @@ class PlantEquations:
         f = ca.Function(name, inputs, [ca.densify(cse(ca.vertcat(*outputs)))])
         return ca.Function(name, f.sx_in(), [ca.densify(cse(folded(f)))], ["t", "x", "p"], ["y"])
 
-    @property
+    @cached_property
     def _material(self):
         """Rows of the material constraints, which have full rank, and points of their manifold."""
-        return self._rows[:2]
-
-    @cached_property
-    def _rows(self):
-        """The same, and what eliminations left out."""
         m, context = self.mechanism, self._context
-        with noting_dropped() as entries:
-            rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
+        rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
         require_inertia(m, rows, points)
-        return rows, points, entries
-
-    @cached_property
-    def _context(self):
-        """Where orders and pivots are decided."""
-        return Context(self.mechanism.parameters.symbols, self.values, WINDOW, {})
+        return rows, points
 
     def near(self, t, x, values):
         """The same equations with orders and pivots decided near a state x (n_x,) at t [s], with these parameters."""
-        forces, damped, lagged, _ = self.choices
-        again = PlantEquations(self.mechanism, forces, damped, lagged, tuple(values))
         state = dict(zip((*self.q.names, *self.q.jet_names(1)), map(float, x), strict=False))
-        window = t - NEARBY, t + NEARBY
-        again._context = Context(self.mechanism.parameters.symbols, again.values, window, state, NEAR_SPREAD)
-        return again
-
-    def points_at(self, t, x, values):
-        """Points at times t (N,) and states x (n_x, N)."""
-        return self._material[1].at(t, x[: self.q.nq + self.q.n], np.asarray(values))
-
-    @cached_property
-    def entries_dropped(self):
-        """What eliminations left out as zero, unless all terms cancel by algebra: a list of SX."""
-        from servoctl.jets.algebra import cancels
-
-        return [entry for entry in (*self._rows[2], *self._solved[2]) if not cancels(entry)]
-
-    @cached_property
-    def dropped(self):
-        """These, and the sizes of their terms, compiled, of (t, x, p); None if nothing was left out."""
-        entries = self.entries_dropped
-        if not entries:
-            return None
-        return compiled(self.function("dropped", [*entries, *map(size_of_terms, entries)]), "dropped")
+        parameters, window = self.mechanism.parameters.symbols, (t - NEARBY, t + NEARBY)
+        context = Context(parameters, np.array(values), window, state, NEAR_SPREAD)
+        return PlantEquations(self.mechanism, *self.choices[:-1], tuple(values), context)
 
     def require_inertia(self, values):
         """Raise SpecificationError if the mass matrix is not positive with parameters (n_p,) or (n_p, N)."""
@@ -179,29 +147,8 @@ class PlantEquations:
             return True
         if self.orders and not all(self.orders.hold(self._points(case)) for case in values.T):
             return False
-        if self.dropped is not None and self._alive(values):
-            return False
-        return bool(strong(self._pivot_sizes(values), self._usual_pivots).all())
-
-    def _alive(self, values):
-        """Whether an entry that was left out is not zero at a point with parameters (n_p, N)."""
-        shares = np.split(np.abs(self._dropped_at_points(values)), 2)
-        suspects = (shares[0] > SUSPECT * shares[1]).any(axis=(0, 2))
-        entries, points = self.entries_dropped, self._material[1]
-        return any(alive(entries, replace(points, values=case)).any() for case in values.T[suspects])
-
-    @cached_property
-    def _dropped_at_points(self):
-        entries = self.entries_dropped
-        return self._at_points(ca.vertcat(*entries, *map(size_of_terms, entries)))
-
-    @cached_property
-    def _usual_pivots(self):
-        return self._pivot_sizes(self.values[:, None])
-
-    def _pivot_sizes(self, values):
-        """Least sizes of the pivots over all points (pivots, N) with parameters (n_p, N)."""
-        return np.abs(self._pivots(values)).min(axis=2, initial=np.inf)
+        here, usual = (np.abs(self._pivots(v)).min(axis=2, initial=np.inf) for v in (values, self.values[:, None]))
+        return bool(strong(here, usual).all())
 
     def _points(self, values):
         """Points of the material constraints with other parameters."""
@@ -243,16 +190,15 @@ class PlantEquations:
 
     @cached_property
     def _solved(self):
-        """[γ''; -λ] from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], the pivots, and what elimination left out."""
+        """[γ''; -λ] from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], and the pivots."""
         q, (rows, points) = self.q, self._material
         acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if rows else ca.SX(0, 1)
         driven = self.mechanism.E @ self.force + self.d + self.forces + self.resisting
         force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
-        with noting_dropped() as entries:
-            solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
-        return cse(solution), pivots, entries
+        solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
+        return cse(solution), pivots
 
     @cached_property
     def state_rates(self):

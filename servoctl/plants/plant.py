@@ -115,20 +115,26 @@ def part_of(whole, mechanism):
         return whole
     kinds = (("q", source.q.names, q.names), ("w", source.q.velocity_names, q.velocity_names))
     places = {(kind, i) for kind, names, kept in kinds for i, name in enumerate(names) if name in kept}
-    forces = dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True))
-    rows = [{("w", i), *source.places(force)} for i, force in enumerate(forces.values())]
+    rows = [{("w", i), *source.places(force)} for i, force in enumerate(whole.equations.forces.elements())]
     if any(row & places and not row <= places for row in (*source.couplings(), *rows)):
         return whole
-    part = source.part(places)
-    names = part.q.force_names
-    by_actuator = ("limits", "rate_limits", "lag", "delay")
+    part, by_actuator = source.part(places), ("limits", "rate_limits", "lag", "delay")
     numbers = {what: {n: v for n, v in getattr(whole, what).items() if n in part.actuators} for what in by_actuator}
+    return made_again(whole, part, **numbers)
+
+
+def made_again(whole, mechanism, **of_actuators):
+    """The plant of a mechanism with the forces, damping and parameters of a whole one."""
+    names, forces = (
+        mechanism.q.force_names,
+        dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True)),
+    )
     return plant(
-        part,
+        mechanism,
         forces={name: forces[name] for name in names if not forces[name].is_zero()},
         damping={name: c for name, c in whole.damping.items() if name in names},
-        **numbers,
-        **dict(zip(part.parameters.names, whole.parameters.tolist(), strict=False)),
+        **of_actuators,
+        **dict(zip(mechanism.parameters.names, whole.parameters.tolist(), strict=False)),
     )
 
 
@@ -201,13 +207,13 @@ class Plant(Value, Shown):
         -------
         (n_p,) or (n_p, N) array
         """
-        u = np.zeros(len(self.inputs)) if u is None else _sized("u", u, len(self.inputs))
-        d = np.zeros(len(self.disturbable)) if d is None else _sized("d", d, len(self.disturbable))
-        if u.ndim == 1:
-            return np.concatenate([self.parameters, u, array_of("d", d, len(self.disturbable))])
-        fixed = np.repeat(self.parameters[:, None], u.shape[1], axis=1)
-        d = np.repeat(d[:, None], u.shape[1], axis=1) if d.ndim == 1 else _sized("d", d, len(d), u.shape[1])
-        return np.concatenate([fixed, u, d])
+        m, n = len(self.inputs), len(self.disturbable)
+        u = np.zeros(m) if u is None else as_numbers(u)
+        d = np.zeros(n) if d is None else array_of("d", d, n)
+        if u.ndim != 2 or len(u) != m:
+            return np.concatenate([self.parameters, array_of("u", u, m), d])
+        fixed, d = (np.repeat(part[:, None], u.shape[1], axis=1) for part in (self.parameters, d))
+        return np.concatenate([fixed, u, d])  # u is NaN where a motion ended
 
     def disturbed(self, name):
         """The index in p of what a disturbance acts on.
@@ -392,14 +398,6 @@ class Plant(Value, Shown):
             "  damping: ": _text(self.damping),
         }
         return "\n".join(f"{what}{text}"[:118] for what, text in entries.items() if text)
-
-
-def _sized(name, value, size, count=None):
-    """Values (size,) or (size, N), NaN where a motion ended; N is `count`, if that is given."""
-    array = as_numbers(value)
-    if array.ndim == 2 and len(array) == size and count in (None, array.shape[1]):
-        return array
-    return array_of(name, value, size) if count is None else array_of(name, value, size, count)
 
 
 def _text(values):
