@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.checks import as_span, by_name, interval, mapping, numbers_by_name, positive_number, require_kind
+from servoctl.control.extremes import extremes
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -16,7 +17,6 @@ from servoctl.errors import (
     warn,
 )
 from servoctl.inversion.relaxed import relaxed
-from servoctl.inversion.report import extremes
 from servoctl.inversion.transfer import Near, rests
 from servoctl.inversion.verdict import (
     FLAT,
