@@ -22,6 +22,20 @@ def extremes(run, name):
     return tuple((value, t) for t, value in run.extrema(name))
 
 
+def excesses(run, limits):
+    """(excess relative to the limit, signal, side, instant [s]) at each side of limits, (low, high) by signal."""
+    for name, (low, high) in limits.items():
+        (least, t_least), (most, t_most) = extremes(run, name)
+        size = size_of_limit(low, high) or max(abs(least), abs(most)) or 1.0
+        yield float((low - least) / size), name, "lower", t_least
+        yield float((most - high) / size), name, "upper", t_most
+
+
+def size_of_limit(low, high):
+    """The larger finite side of a limit."""
+    return max(abs(side) for side in (low, high) if np.isfinite(side))
+
+
 def sampled_extremes(t, values):
     """The same of samples (N,)."""
     if not np.isfinite(values).any():

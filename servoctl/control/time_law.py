@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from servoctl.checks import as_span, finite, interval, mapping, require_kind
+from servoctl.control.extremes import excesses, extremes
 from servoctl.control.time_optimal import Curve, Inverse, Problem, smooth
 from servoctl.errors import (
     InconsistentStart,
@@ -30,7 +31,6 @@ from servoctl.values import frozen
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
 BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
 TIGHTENED, TIGHTER = 5, 1.2  # how often a time-optimal law is solved; limits at nodes give way by this many excesses
-SHORT = 1e-6  # of the span: intervals of samples that are too short for a difference quotient
 REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
 
@@ -176,7 +176,8 @@ def _optimal(scene, bar):
 
     _, slow = _bracket(attempt)
     law, plan = smooth((t1 - t0) * slow, inverse.order), attempt(slow)[-1]
-    sides = np.array([*scene.limits.values()]).T
+    limits = np.array([*scene.limits.values()]).T
+    sides = limits.copy()
     for _ in range(TIGHTENED):
         law = Problem(inverse, sides, law, plan).solved()
         excess, binding, program, plan = scene.along(curve, law.expression(t, t0), law.duration)
@@ -185,8 +186,8 @@ def _optimal(scene, bar):
             return TimeLaw(law.duration / (t1 - t0), program, plan if plan.model.flat else judged(plan), binding)
         if plan is None:
             break
-        beyond = [[max(0.0, e) for e in _excesses(plan, name, *scene.limits[name])] for name in scene.limits]
-        sides += TIGHTER * np.array(beyond).T * [[1.0], [-1.0]]
+        values = np.array([[value for value, _ in extremes(plan, name)] for name in scene.limits]).T
+        sides += TIGHTER * np.clip(limits - values, [[0.0], [-np.inf]], [[np.inf], [0.0]])
         if np.any(sides[0] >= sides[1]):
             break
     raise LimitExceeded(
@@ -251,41 +252,8 @@ def _bracket(attempt):
 
 def _worst(plan, limits):
     """Largest excess over the limits, relative to their size, and its (signal, side, instant)."""
-    excesses = []
-    for name, (low, high) in limits.items():
-        (t_low, least), (t_high, most) = _extrema_of(plan, name)
-        size = max(abs(v) for v in (low, high) if np.isfinite(v)) or max(abs(least), abs(most)) or 1.0
-        below, above = _excesses(plan, name, low, high)
-        excesses += [(below / size, (name, "lower", t_low)), (above / size, (name, "upper", t_high))]
-    return max(excesses)
-
-
-def _excesses(plan, name, low, high):
-    """By how much a signal exceeds its lower and its upper limit."""
-    (_, least), (_, most) = _extrema_of(plan, name)
-    return low - least, most - high
-
-
-def _extrema_of(plan, name):
-    """((t, least), (t, most)) of a signal or a rate."""
-    if not _differenced(plan, name):
-        return plan.extrema(name)
-    t, rates = _values(plan, name)
-    return tuple((float(t[i]), float(rates[i])) for i in (np.argmin(rates), np.argmax(rates)))
-
-
-def _differenced(plan, name):
-    """Whether a name is that of a rate that is taken from the samples at both ends of intervals."""
-    return name not in plan.names and name[:1] == "d" and name[1:] in plan.names
-
-
-def _values(plan, name):
-    """Times and values of a signal or a rate."""
-    if not _differenced(plan, name):
-        return plan.t, plan[name]
-    whole = np.append(True, np.diff(plan.t) > SHORT * np.ptp(plan.t))
-    t, values = plan.t[whole], plan[name[1:]][whole]
-    return t[:-1], np.diff(values) / np.diff(t)
+    excess, *binding = max(excesses(plan, limits))
+    return excess, tuple(binding)
 
 
 def _level(model, name):

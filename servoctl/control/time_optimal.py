@@ -10,13 +10,13 @@ Entries of the state that the rows leave free, the internal dynamics, are colloc
 """
 
 from copy import copy
-from functools import cached_property
 from math import comb, factorial
 
 import casadi as ca
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from servoctl.control.nonlinear import NonlinearProgram, words
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
 from servoctl.methods.radau import radau
 from servoctl.model.model import derived
@@ -31,17 +31,6 @@ DEGREES = (1, 2, 4, 8, 12, 16, 20)  # of the polynomial of the arc length that a
 SPLINE = (9, 80)  # the degree and the intervals of its spline
 MISSED = (1e-12, 1e-8)  # of its extent: by which the polynomial, and the spline, may miss it
 PANELS, GAUSS = 2000, np.polynomial.legendre.leggauss(8)  # of the quadrature of the arc length
-NEWTON_STEPS = 4  # to the instant of an arc length, from its secant
-IPOPT = {
-    "print_level": 0,
-    "sb": "yes",
-    "tol": 1e-8,
-    "acceptable_tol": 1e-6,
-    "max_iter": 500,
-    "bound_relax_factor": 0.0,
-    "nlp_scaling_method": "none",
-    "mu_strategy": "adaptive",
-}
 LEAST = 1e-4  # duration, relative to that of the first motion
 
 
@@ -100,52 +89,35 @@ class Curve:
         return tuple(np.array(part) for part in self._offsets.map(len(t))(np.asarray(t, dtype=float)[None]))
 
     def _by_arc_length(self):
-        """Ends of pieces (n + 1,) in s and coefficients (degree + 1, n, k), as for `paths.piecewise`."""
-        from scipy.interpolate import make_interp_spline
+        """Ends of pieces (n + 1,) in s and coefficients (degree + 1, n, k), as for `paths.piecewise`.
 
-        places = self._by_length
-        check = np.linspace(0.0, 1.0, 403)[1:-1]
-        known = places(check)
+        Polynomials are fitted to the places at the ends of panels of time, whose parts of the length are known.
+        """
+        from scipy.interpolate import BSpline
+
+        panels = np.linspace(*self.span, PANELS + 1)
+        t = panels[:-1, None] + np.diff(panels)[:, None] * (1 + GAUSS[0]) / 2
+        length = np.append(0.0, np.cumsum(self._speed(t.ravel()).reshape(t.shape) @ GAUSS[1]))
+        part, places = length / length[-1], self._along(panels)[0].T
         for degree in DEGREES:
-            y = -np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))
-            fit = chebyshev.chebfit(y, places((1 + y) / 2), degree)
-            if (np.abs(chebyshev.chebval(2 * check - 1, fit).T - known) / self.extent).max() < MISSED[0]:
+            fit = chebyshev.chebfit(2 * part - 1, places, degree)
+            if (np.abs(chebyshev.chebval(2 * part - 1, fit).T - places) / self.extent).max() < MISSED[0]:
                 powers = np.array([np.pad(p := chebyshev.cheb2poly(c), (0, degree + 1 - len(p))) for c in fit.T])
                 return np.array([0.0, 1.0]), powers.T[:, None, :]
         degree, count = SPLINE
-        s = np.linspace(0.0, 1.0, count + 1)
-        curve = make_interp_spline(s, places(s), k=degree)
-        miss = np.abs(curve(check) - known) / self.extent
+        s, half = np.linspace(0.0, 1.0, count + 1), 0.5 / count
+        knots = np.pad(s, degree, mode="edge")
+        matrix = BSpline.design_matrix(part, knots, degree).toarray()
+        curve = BSpline(knots, np.linalg.lstsq(matrix, places, rcond=None)[0], degree)
+        miss = np.abs(curve(part) - places) / self.extent
         if not miss.max() < MISSED[1]:
             k, i = np.unravel_index(np.argmax(miss), miss.shape)
-            raise self._refused(list(self.moving)[i], f"turns sharply at {check[k]:.3g} of the length of its curve")
-        half = 0.5 / count
+            raise self._refused(list(self.moving)[i], f"turns sharply at {part[k]:.3g} of the length of its curve")
         coefficients = [curve(s[:-1] + half, nu=j) / factorial(j) * half**j for j in range(degree + 1)]
         return s, np.array(coefficients)
 
     def _speed(self, t):
         return np.linalg.norm(self._along(t)[1] / self.extent[:, None], axis=0)
-
-    @cached_property
-    def _lengths(self):
-        """The length of the curve at the ends of panels of time, each (PANELS + 1,)."""
-        panels = np.linspace(*self.span, PANELS + 1)
-        t = panels[:-1, None] + np.diff(panels)[:, None] * (1 + GAUSS[0]) / 2
-        pieces = self._speed(t.ravel()).reshape(t.shape) @ GAUSS[1] * np.diff(panels) / 2
-        return panels, np.append(0.0, np.cumsum(pieces))
-
-    def _by_length(self, s):
-        """Places (M, k) of the curve at parts s (M,) of its length, by Newton's method in the panel of each."""
-        panels, length = self._lengths
-        target = np.asarray(s) * length[-1]
-        k = np.clip(np.searchsorted(length, target, side="right") - 1, 0, PANELS - 1)
-        t = np.interp(target, length, panels)
-        for _ in range(NEWTON_STEPS):
-            half = (t - panels[k]) / 2
-            inside = self._speed((panels[k, None] + half[:, None] * (1 + GAUSS[0])).ravel()).reshape(len(t), -1)
-            miss, speed = length[k] + half * (inside @ GAUSS[1]) - target, self._speed(t)
-            t = np.clip(t - np.divide(miss, speed, out=np.zeros_like(t), where=speed > 0), panels[k], panels[k + 1])
-        return self._along(t)[0].T
 
     def program_along(self, law):
         """The program whose curve is followed by a law s, an SX scalar from 0 to 1."""
@@ -232,28 +204,22 @@ def taylor(rows, k, step):
 
 
 def resting(top, k):
-    """Values (N + 1,) of s^(k) nearest to these whose integrals go from rest at s = 0 to rest at s = 1."""
-    count = len(top) - 1
+    """Jets of the law whose s^(k), with values (N + 1,) nearest to these, leads from rest at s = 0 to rest at s = 1."""
+    from scipy.interpolate import BSpline
 
-    def integrals(values):
-        state = np.zeros((k + 1, values.shape[1]))
-        state[k] = values[0]
-        for slopes in np.diff(values, axis=0) * count:
-            state = taylor(k + 1, k, 1.0 / count) @ np.vstack([state, slopes])
-        return state
+    ends = np.linspace(0.0, 1.0, len(top))
 
-    fixed = np.array(top, dtype=float)
-    fixed[[0, -1]] = 0.0
-    ends = integrals(np.eye(count + 1))[:k, 1:-1]
-    size = np.abs(ends).sum(axis=1, keepdims=True)
+    def jets(top):
+        linear = BSpline(np.pad(ends, 1, mode="edge"), top, 1)
+        return np.array([*(linear.antiderivative(k - j)(ends) for j in range(k)), top])
+
+    fixed = np.append(0.0, np.append(top[1:-1], 0.0))
+    at_end = jets(np.eye(len(top)))[:k, -1, 1:-1]
+    size = np.abs(at_end).sum(axis=1)
     for _ in range(2):
-        miss = np.eye(k)[:, 0] - integrals(fixed[:, None])[:k, 0]
-        fixed[1:-1] += np.linalg.lstsq(ends / size, miss / size[:, 0], rcond=None)[0]
-    jets = np.zeros((k + 1, count + 1))
-    for i, slope in enumerate(np.diff(fixed) * count):
-        jets[k, i] = fixed[i]
-        jets[:, i + 1] = taylor(k + 1, k, 1.0 / count) @ np.append(jets[:, i], slope)
-    return jets
+        miss = np.eye(k)[0] - jets(fixed)[:k, -1]
+        fixed[1:-1] += np.linalg.lstsq(at_end / size[:, None], miss / size, rcond=None)[0]
+    return jets(fixed)
 
 
 def _each(sizes, count):
@@ -328,20 +294,19 @@ class Problem:
         jets = ca.diag(ca.DM(self.sizes)) @ s
         equal, values = self._constraints(T * self.law.duration, jets, ca.diag(ca.DM(self.z_size)) @ z)
         problem = {"x": ca.veccat(T, s, z), "f": T, "g": ca.vertcat(equal, values)}
-        solver = ca.nlpsol("time_optimal", "ipopt", problem, {"print_time": False, "ipopt": IPOPT})
         zeros, free = np.zeros(equal.numel()), np.full(z.numel(), np.inf)
         sides = [np.tile(side / self.value_size, values.numel() // max(len(side), 1)) for side in self.limits]
         first = [(self.law.jets / self.sizes[:, None]).ravel("F"), (self.z / self.z_size[:, None]).ravel("F")]
-        result = solver(
+        result, stats = NonlinearProgram(problem).solve(
             x0=np.concatenate([[1.0], *first]),
             lbx=np.concatenate([[LEAST], self._sides(0), -free]),
             ubx=np.concatenate([[np.inf], self._sides(1), free]),
             lbg=np.concatenate([zeros, sides[0]]),
             ubg=np.concatenate([zeros, sides[1]]),
         )
-        w, stats = np.array(result["x"]).ravel(), solver.stats()
-        if not stats["success"]:
+        if words(stats):
             raise _failed(stats)
+        w = result["x"]
         top = w[1 : 1 + s.numel()].reshape(s.shape, order="F")[k] * self.sizes[k]
         return Law(w[0] * self.law.duration, resting(top, k))
 
@@ -377,11 +342,10 @@ class Problem:
 
 
 def _failed(stats):
-    status = stats["return_status"]
     return IntegrationStopped(
-        f"IPOPT ends with {status} after {stats['iter_count']} iterations.",
+        f"IPOPT {words(stats)}, after {stats['iter_count']} iterations.",
         "A time-optimal law is a minimum of the duration.",
         do="Choose wider limits, a simpler curve, or shape=False.",
-        status=status,
+        status=stats["return_status"],
         iterations=stats["iter_count"],
     )

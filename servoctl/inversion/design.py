@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_list, by_name, finite, interval, mapping, named, numbers_by_name, require_kind, texts
-from servoctl.control.extremes import extremes, rates
+from servoctl.control.extremes import excesses, extremes, rates, size_of_limit
 from servoctl.control.time_law import REACHED
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, UnstableInternalDynamics
 from servoctl.growth import internal_dynamics
@@ -347,7 +347,7 @@ class Search:
         place = self.signals.index
         self.peaks = [(place(name), sign, 0.0, size) for name, size in sizes.items() for sign in (1.0, -1.0)]
         self.sides = [
-            (place(name), sign, side, _size_of_limit(*ends))
+            (place(name), sign, side, size_of_limit(*ends) or 1.0)
             for name, ends in limits.items()
             for sign, side in zip((1.0, -1.0), ends, strict=True)
             if np.isfinite(side)
@@ -432,7 +432,7 @@ class Search:
                     return self.designed(v, before, plan)
                 v = less
             self.at_nodes(np.append(self.parts, parts))
-        if any(excess > 0 for excess, *_ in _beyond_limits(plan, self.limits)):
+        if any(excess > 0 for excess, *_ in excesses(plan, self.limits)):
             raise self.beyond(plan)
         return self.designed(v, before, plan)
 
@@ -442,12 +442,7 @@ class Search:
         if not plan.model.flat and self.motions.method is None:
             _require_no_growth(plan.model, plan)
             plan = judged(plan)
-        limits = [
-            (name, side)
-            for name, ends in self.limits.items()
-            for (value, _), limit, side in zip(extremes(plan, name), ends, ("lower", "upper"), strict=True)
-            if np.isfinite(limit) and abs(value - limit) <= REACHED * _size_of_limit(*ends)
-        ]
+        limits = [(name, side) for excess, name, side, _ in excesses(plan, self.limits) if abs(excess) <= REACHED]
         at_ends = [
             (name, "lower" if x < 0.5 else "upper")
             for name, x in zip(values, v, strict=True)
@@ -535,7 +530,7 @@ class Search:
 
     def beyond(self, plan):
         """The error of a motion that exceeds a limit."""
-        excess, name, t = max(_beyond_limits(plan, self.limits))
+        excess, name, _, t = max(excesses(plan, self.limits))
         (least, _), (most, _) = extremes(plan, name)
         return LimitExceeded(
             f"With the least excess that was found {name} exceeds its limit by {100 * excess:.3g} % at t = {t:.4g} s.",
@@ -622,20 +617,6 @@ def _quadrature(edges):
     ends = subdivided(edges, counts)
     (x, weights), half = EIGHT_NODES, np.diff(ends)[:, None] / 2
     return (ends[:-1, None] + half * (1 + x)).ravel(), (half * weights).ravel()
-
-
-def _size_of_limit(low, high):
-    """The size of a limit: its larger finite side."""
-    return max(abs(side) for side in (low, high) if np.isfinite(side)) or 1.0
-
-
-def _beyond_limits(plan, limits):
-    """(excess relative to the limit, name, instant) of each signal at each side."""
-    for name, (low, high) in limits.items():
-        (least, t_least), (most, t_most) = extremes(plan, name)
-        size = _size_of_limit(low, high)
-        yield float((low - least) / size), name, float(t_least)
-        yield float((most - high) / size), name, float(t_most)
 
 
 def _extrema_beyond(plan, name, low, high):
