@@ -23,12 +23,12 @@ def extremes(run, name):
 
 
 def excesses(run, limits):
-    """(excess relative to the limit, signal, side, instant [s]) at each side of limits, (low, high) by signal."""
+    """(excess relative to the limit, signal, side, instant [s], value, limit) at each side of (low, high) by signal."""
     for name, (low, high) in limits.items():
         (least, t_least), (most, t_most) = extremes(run, name)
         size = size_of_limit(low, high) or max(abs(least), abs(most)) or 1.0
-        yield float((low - least) / size), name, "lower", t_least
-        yield float((most - high) / size), name, "upper", t_most
+        yield float((low - least) / size), name, "lower", t_least, least, low
+        yield float((most - high) / size), name, "upper", t_most, most, high
 
 
 def size_of_limit(low, high):

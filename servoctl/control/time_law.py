@@ -252,8 +252,8 @@ def _bracket(attempt):
 
 def _worst(plan, limits):
     """Largest excess over the limits, relative to their size, and its (signal, side, instant)."""
-    excess, *binding = max(excesses(plan, limits))
-    return excess, tuple(binding)
+    excess, name, side, t, *_ = max(excesses(plan, limits))
+    return excess, (name, side, t)
 
 
 def _level(model, name):

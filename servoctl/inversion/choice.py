@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.checks import as_span, by_name, interval, mapping, numbers_by_name, positive_number, require_kind
-from servoctl.control.extremes import excesses, extremes
+from servoctl.control.extremes import excesses
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -288,12 +288,11 @@ def _by_hand(request, model, begin, found, chosen, method):
 
 def _excess(run, ranges):
     """What of a run lies beyond its ranges, in words; "" if nothing does."""
-    excess, name, side, t = max(excesses(run, ranges), default=(0.0, "", "", 0.0))
-    if excess <= 0:
+    if not ranges:
         return ""
-    least, most = (value for value, _ in extremes(run, name))
-    value, limit = (least, ranges[name][0]) if side == "lower" else (most, ranges[name][1])
-    return f"the exact plan needs {name} = {value:.6g} at t = {t:.4g} s, and the limit is {limit:g}"
+    excess, name, _, t, value, limit = max(excesses(run, ranges))
+    beyond = f"the exact plan needs {name} = {value:.6g} at t = {t:.4g} s, and the limit is {limit:g}"
+    return beyond if excess > 0 else ""
 
 
 def _with_reason(run, why, note=""):

@@ -442,7 +442,7 @@ class Search:
         if not plan.model.flat and self.motions.method is None:
             _require_no_growth(plan.model, plan)
             plan = judged(plan)
-        limits = [(name, side) for excess, name, side, _ in excesses(plan, self.limits) if abs(excess) <= REACHED]
+        limits = [(name, side) for excess, name, side, *_ in excesses(plan, self.limits) if abs(excess) <= REACHED]
         at_ends = [
             (name, "lower" if x < 0.5 else "upper")
             for name, x in zip(values, v, strict=True)
@@ -530,7 +530,7 @@ class Search:
 
     def beyond(self, plan):
         """The error of a motion that exceeds a limit."""
-        excess, name, _, t = max(excesses(plan, self.limits))
+        excess, name, _, t, *_ = max(excesses(plan, self.limits))
         (least, _), (most, _) = extremes(plan, name)
         return LimitExceeded(
             f"With the least excess that was found {name} exceeds its limit by {100 * excess:.3g} % at t = {t:.4g} s.",
