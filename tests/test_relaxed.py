@@ -346,7 +346,7 @@ def test_the_plant_follows_the_plan(scene):
 def test_stiff_machines_are_solved_in_a_few_iterations():
     """Eight segments, the first solution, with modes of 650 rad/s in intervals of 0.09 s."""
     mechanism, program = flexible_link(8)
-    relaxation = Relaxation(sv.plant(mechanism), program, (0.0, 2.2), ({}, {}), None, None, "rest")
+    relaxation = Relaxation(sv.plant(mechanism), program, (0.0, 2.2), {}, None, None, "rest")
     plan = relaxation._solved(relaxation._first(relaxation._mesh()), [FIRST * relaxation._usual_weights()])
     assert plan.iterations[0] <= 5
 

@@ -121,10 +121,15 @@ def fastest(
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     require_kind(Program, "program", program, "sv.Program({...})")
+    limits = mapping(limits, "The limits")
+    if not limits:
+        raise SpecificationError(
+            "There are no limits.", "The fastest time law reaches a limit.", do='Pass some, as {"trolley": 100.0}.'
+        )
     scene = _Scene(
         needed(mechanism, program, named=[name for given in (limits, start, guess) for name in names_of(given)]),
         program,
-        {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()},
+        {name: interval(name, value, "limit") for name, value in limits.items()},
         as_span(t_span, forward=True),
         {name: finite(name, value, "start value") for name, value in mapping(start, "The start values").items()},
         guess,
@@ -141,7 +146,8 @@ def _even(scene, bar):
     @functools.cache
     def attempt(factor):
         try:
-            return scene.slowed(factor)
+            slower = scene.program.slowed(scene.mechanism.q, factor, at=scene.t_span[0])
+            return scene.tried(slower, factor)
         finally:
             bar.update()
 
@@ -169,9 +175,15 @@ def _optimal(scene, bar):
     @functools.cache
     def attempt(factor):
         step = rest_to_rest(t - t0, 0.0, 1.0, (t1 - t0) * factor, inverse.order)
-        found = scene.along(curve, step, (t1 - t0) * factor)
+        found = scene.tried(curve.program_along(step), factor)
         bar.update()
-        _require_stable(found[-1])
+        if found[-1] is not None and not found[-1].model.flat:
+            require_no_growth(
+                found[-1],
+                "curve",
+                "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
+                "Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
+            )
         return found
 
     _, slow = _bracket(attempt)
@@ -180,7 +192,9 @@ def _optimal(scene, bar):
     sides = limits.copy()
     for _ in range(TIGHTENED):
         law = Problem(inverse, sides, law, plan).solved()
-        excess, binding, program, plan = scene.along(curve, law.expression(t, t0), law.duration)
+        excess, binding, program, plan = scene.tried(
+            curve.program_along(law.expression(t, t0)), law.duration / (t1 - t0)
+        )
         bar.update()
         if excess <= 0:
             return TimeLaw(law.duration / (t1 - t0), program, plan if plan.model.flat else judged(plan), binding)
@@ -211,22 +225,8 @@ class _Scene:
     guess: dict
     parameters: dict
 
-    def __post_init__(self):
-        if not self.limits:
-            raise SpecificationError(
-                "There are no limits.", "The fastest time law reaches a limit.", do='Pass some, as {"trolley": 100.0}.'
-            )
-
-    def slowed(self, factor):
+    def tried(self, slower, factor):
         """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""
-        return self._tried(self.program.slowed(self.mechanism.q, factor, at=self.t_span[0]), factor)
-
-    def along(self, curve, law, duration):
-        """The same of a law along the curve, an SX scalar."""
-        t0, t1 = self.t_span
-        return self._tried(curve.program_along(law), duration / (t1 - t0))
-
-    def _tried(self, slower, factor):
         t0, t1 = self.t_span
         try:
             model = derived(self.mechanism, slower, self.guess)
@@ -236,7 +236,8 @@ class _Scene:
             plan = simulated(model, start, (t0, t0 + (t1 - t0) * factor), progress=False)
         except (SingularProgram, InconsistentStart, IntegrationStopped):
             return np.inf, ("", "", t0), slower, None
-        return *_worst(plan, self.limits), slower, plan
+        excess, name, side, t, *_ = max(excesses(plan, self.limits))
+        return excess, (name, side, t), slower, plan
 
 
 def _bracket(attempt):
@@ -248,12 +249,6 @@ def _bracket(attempt):
         if (attempt(factor)[0] > -BELOW) != (step > 1):
             return min(before, factor), max(before, factor)
     raise _unreached(factor) if step < 1 else _exceeded(attempt(factor), factor)
-
-
-def _worst(plan, limits):
-    """Largest excess over the limits, relative to their size, and its (signal, side, instant)."""
-    excess, name, side, t, *_ = max(excesses(plan, limits))
-    return excess, (name, side, t)
 
 
 def _level(model, name):
@@ -271,17 +266,12 @@ def _unreached(factor):
     )
 
 
-def _require_stable(plan):
-    """Refuse a plan, if there is one, along which errors of the internal dynamics grow."""
-    if plan is None or plan.model.flat:
-        return
+def require_no_growth(plan, where, rule, do):
+    """Refuse a motion along which errors of what the program leaves free grow."""
     internal = internal_dynamics(plan)
     if internal.verdict == "unstable":
         raise UnstableInternalDynamics(
-            f"Along the curve {internal.sentence()}.",
-            "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
-            do="Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
-            growth=float(internal.growth),
+            f"Along the {where} {internal.sentence()}.", rule, do=do, growth=float(internal.growth)
         )
 
 

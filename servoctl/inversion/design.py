@@ -19,12 +19,11 @@ import numpy as np
 
 from servoctl.checks import as_list, by_name, finite, interval, mapping, named, numbers_by_name, require_kind, texts
 from servoctl.control.extremes import excesses, extremes, rates, size_of_limit
-from servoctl.control.time_law import REACHED
-from servoctl.errors import LimitExceeded, ServoError, SpecificationError, UnstableInternalDynamics
-from servoctl.growth import internal_dynamics
+from servoctl.control.time_law import REACHED, require_no_growth
+from servoctl.control.time_optimal import quadrature
+from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.markup import Shown
-from servoctl.methods.bounded import subdivided
 from servoctl.methods.choice import Bounded
 from servoctl.model.model import Model
 from servoctl.progress import progress_bar
@@ -36,7 +35,7 @@ from servoctl.verification import Verification, verify
 
 MINIMISED = ("rms", "peak", "time")
 FIRST_NODES = 100  # instants of the motion at which inequalities hold, before extrema between them are added
-SQUARE_PANELS, EIGHT_NODES = 256, np.polynomial.legendre.leggauss(8)  # of the quadrature; knots end panels
+SQUARE_PANELS = 256  # of the quadrature; knots end panels
 SAFELY_INSIDE = 1e-6  # of a limit: by which it is stricter at nodes, and by which a peak may exceed that at nodes
 SEARCHES = 12  # of the search, each with more nodes than the one before
 APART = 1e-6  # of the motion: least distance of two nodes
@@ -44,6 +43,11 @@ QUADRATIC_PROGRAMS = 200  # of sequential quadratic programming
 UNCHANGED = 1e-12  # change of the cost, relative to that before, with which sequential quadratic programming ends
 ACTIVE = 1e-5  # distance from an inequality, relative to the limit, within which it counts as met
 STATIONARY = 1e-4  # of the cost: largest gain across the ranges at a local minimum
+GROWS = (
+    "motion",
+    "A design is one of exact inverses: flat, bounded, or integrated forward where errors do not grow.",
+    "Begin and end the program with a dwell, or choose another output.",
+)  # where errors grow, the rule, and what to do
 PROBED = (0.1, 0.3)  # of the ranges: how far from a minimum less cost is looked for
 
 
@@ -267,7 +271,7 @@ class Motions:
         first = self.run(model)
         self.guess = dict(zip(model.state_names, np.asarray(first.start.values).tolist(), strict=False))
         if not model.flat and self.method is None:
-            _require_no_growth(model, first)
+            require_no_growth(first, *GROWS)
             free = sensitivity(first, model.state_names[0], names).independent
             self.held = {name: self.guess[name] for name in free}
         self.t1 = float(self.ends(self.numbers)[0])
@@ -309,18 +313,6 @@ class Motions:
         else:
             begin = np.array(list(self.guess.values()))
         return simulated(model, begin, (self.t0, t1), self.method, t_eval=times, progress=False)
-
-
-def _require_no_growth(model, run):
-    """Refuse a motion that is integrated forward, along which errors grow."""
-    internal = internal_dynamics(run)
-    if internal.verdict == "unstable":
-        raise UnstableInternalDynamics(
-            f"Along the motion {internal.sentence()}.",
-            "A design is one of exact inverses: flat, bounded, or integrated forward where errors do not grow.",
-            do="Begin and end the program with a dwell, or choose another output.",
-            growth=float(internal.growth),
-        )
 
 
 @frozen
@@ -373,7 +365,7 @@ class Search:
         p = self.parameters(v)
         model, (first, last, end_slopes) = self.motions.with_parameters(p), self.motions.window(p)
         nodes = first + self.parts * (last - first)
-        t, weights = _quadrature([first, *(k for k in model.knots if first < k < last), last])
+        t, weights = quadrature([first, *(k for k in model.knots if first < k < last), last], SQUARE_PANELS)
         times, where = np.unique(np.concatenate([nodes, t]), return_inverse=True)
         run = self.motions.run(model, times)
         tangents = sensitivity(run, self.signals, self.motions.names)
@@ -440,7 +432,7 @@ class Search:
         """The result for the unknowns of a minimum, with its plan."""
         values = dict(zip(self.motions.names, self.parameters(v).tolist(), strict=True))
         if not plan.model.flat and self.motions.method is None:
-            _require_no_growth(plan.model, plan)
+            require_no_growth(plan, *GROWS)
             plan = judged(plan)
         limits = [(name, side) for excess, name, side, *_ in excesses(plan, self.limits) if abs(excess) <= REACHED]
         at_ends = [
@@ -609,14 +601,6 @@ class NonlinearProgram:
         least, least_slopes = (part / self.scale for part in self.search.inside(v, self.least))
         slopes = [np.pad(kept_slopes, bounds), np.pad(least_slopes, bounds, constant_values=1.0)]
         return np.concatenate([kept - SAFELY_INSIDE, least + x[-1]]), np.concatenate(slopes)
-
-
-def _quadrature(edges):
-    """Instants (N,) [s] and weights (N,) of a quadrature over pieces."""
-    counts = np.ceil(SQUARE_PANELS * np.diff(edges) / np.ptp(edges)).astype(int)
-    ends = subdivided(edges, counts)
-    (x, weights), half = EIGHT_NODES, np.diff(ends)[:, None] / 2
-    return (ends[:-1, None] + half * (1 + x)).ravel(), (half * weights).ravel()
 
 
 def _extrema_beyond(plan, name, low, high):

@@ -20,6 +20,7 @@ from servoctl.checks import (
     as_span,
     by_name,
     interval,
+    numbers_by_name,
     positive_number,
     positives,
     require_kind,
@@ -53,9 +54,9 @@ FIRST = 1e-3  # first weight, relative to that for which standing still costs as
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
 COARSE = 1e-6  # defect with which no plan is returned
-DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
+DEFECT = 1e-7  # of the states between nodes, relative to their sizes, above which an interval is cut
 PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
-ROUNDS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
+ROUNDS, MOST_INTERVALS = 6, 400  # of the mesh
 SAMPLES = 1000  # of the run, at least
 OPEN = (-np.inf, np.inf)
 
@@ -129,44 +130,41 @@ def relaxed(
     relaxation = Relaxation(at_once(plant), program, as_span(t_span, forward=True), limits, bounds, start, end)
     several = None if isinstance(weight, Mapping) else as_list(weight)
     if several is None:
-        return relaxation.run(_weights(weight, program))
+        return relaxation.run(weights_of(weight, program))
     weights = positives("weight", several, "Write weight=[1e-6, 1e-8].")
     return relaxation.front(array_of("weight", weights, None).tolist())
 
 
-def _weights(weight, program):
+def weights_of(weight, program):
     """β of each residual, (k,); None for the default."""
     if weight is None:
         return None
     if not isinstance(weight, Mapping):
         return np.full(len(program.names), positive_number("weight", weight))
-    weight = by_name(weight, program.names, "residual", "The weights")
+    weight = numbers_by_name(weight, program.names, "residual", "weight", positive=True)
     for name in program.names:
         if name not in weight:
             raise SpecificationError(
                 f"The residual {name!r} has no weight.", "Each residual has one.", do=f"Add {name!r}.", name=name
             )
-    return np.array([positive_number(name, weight[name]) for name in program.names])
+    return np.array([weight[name] for name in program.names])
 
 
 def _all_limits(plant, limits):
-    """The limits of magnitude and of rate, {actuator: (low, high)} each: those of the plant and further ones."""
-    magnitudes = dict(plant.limits)
-    rates = {name: (-rate, rate) for name, rate in plant.rate_limits.items()}
-    names = {name: (magnitudes, name) for name in plant.inputs} | {f"d{name}": (rates, name) for name in plant.inputs}
+    """(low, high) of actuators and of their rates, by name: the limits of the plant and further ones."""
+    known = dict(plant.limits) | {f"d{name}": (-rate, rate) for name, rate in plant.rate_limits.items()}
+    names = [*plant.inputs, *(f"d{name}" for name in plant.inputs)]
     for name, value in by_name(limits, names, "actuator or rate", "The limits").items():
-        sides, actuator = names[name]
-        low, high = interval(name, value, "limit")
-        before = sides.get(actuator, OPEN)
-        sides[actuator] = max(low, before[0]), min(high, before[1])
-        if not sides[actuator][0] < sides[actuator][1]:
+        (low, high), before = interval(name, value, "limit"), known.get(name, OPEN)
+        known[name] = max(low, before[0]), min(high, before[1])
+        if not known[name][0] < known[name][1]:
             raise SpecificationError(
                 f"The limit of {name!r} is ({low:g}, {high:g}), that of the plant ({before[0]:g}, {before[1]:g}).",
                 "Both hold.",
                 do="Choose limits within those of the plant.",
                 name=name,
             )
-    return magnitudes, rates
+    return known
 
 
 @frozen
@@ -277,9 +275,9 @@ class Relaxation(Transfer):
     def _solved(self, plan, weights, iterations=()):
         """The plan of the last of falling weights, each solved from the one before."""
         nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.opening, self.target[2])
-        sides, w, multipliers, iterations = self._sides(plan), nlp.joined(plan.x, plan.points), None, list(iterations)
+        sides, w, iterations = self._sides(plan), nlp.joined(plan.x, plan.points), list(iterations)
         for beta in weights:
-            w, multipliers, stats = nlp.solve(w, beta, sides, None if self.bounds else multipliers)
+            w, stats = nlp.solve(w, beta, sides)
             iterations.append(stats["iter_count"])
             if words(stats):
                 raise self._failed(nlp, plan, beta, stats)
@@ -294,16 +292,17 @@ class Relaxation(Transfer):
         fixed = np.isfinite(self.target[0])
         x[:, fixed, -1] = self.target[0][fixed]
         u = _sides([self.limits.get(name, OPEN) for name in inputs], count)
-        for i, name in enumerate(inputs):
-            if name in self.rates and self.held is not None:
-                u[:, i, 0] = self.held[i]
-            if name in self.rates and self.target[1] is not None and not self.target[2]:
-                u[:, i, -1] = self.target[1][i]
+        rates = [f"d{name}" for name in inputs]
+        limited = np.array([rate in self.limits for rate in rates])  # which do not jump
+        if self.held is not None:
+            u[:, limited, 0] = self.held[limited]
+        if self.target[1] is not None and not self.target[2]:
+            u[:, limited, -1] = self.target[1][limited]
         return {
             "x": x,
             "u": u,
-            "begin": _sides([OPEN if name in self.rates else (0.0, 0.0) for name in inputs], 1),
-            "slope": _sides([self.rates.get(name, OPEN) for name in inputs], count - 1) / u_size[:, None],
+            "begin": _sides(np.where(limited[:, None], OPEN, 0.0), 1),
+            "slope": _sides([self.limits.get(name, OPEN) for name in rates], count - 1) / u_size[:, None],
             "bound": _sides(self.bounds.values(), WATCHED * len(plan.pieces.h)) / size[:, None],
         }
 
@@ -323,13 +322,13 @@ class Relaxation(Transfer):
     def _failed(self, nlp, plan, beta, stats):
         """The error of an iteration that ends without a solution: what would be exceeded without limits, and where."""
         facts = {"status": stats["return_status"], "weights": beta.tolist()}
-        limits = self.limits | {f"d{name}": ends for name, ends in self.rates.items()} | self.bounds
+        limits = self.limits | self.bounds
         free = copy(self)
-        free.limits, free.rates, free.bounds = {}, {}, dict.fromkeys(self.bounds, OPEN)
-        w, _, without = nlp.solve(nlp.joined(plan.x, plan.points), beta, free._sides(plan))
-        if not limits or words(without):
+        free.limits, free.bounds = {}, dict.fromkeys(self.bounds, OPEN)
+        w, without = nlp.solve(nlp.joined(plan.x, plan.points), beta, free._sides(plan)) if limits else (None, stats)
+        if words(without):
             return IntegrationStopped(
-                f"IPOPT {words(stats)}, with or without limits.",
+                f"IPOPT {words(stats)}.",
                 "A plan satisfies the equations of motion and the conditions at both ends.",
                 do="Choose a greater weight, a longer span, or a start and an end nearer to the program.",
                 **facts,
@@ -366,8 +365,7 @@ class Relaxation(Transfer):
     def _finer(self, plan):
         """The plan on a finer mesh where its motion is not that of the plant; None where it is, or at the finest."""
         mesh, defect = plan.mesh, self._defects(plan)
-        pieces = np.ceil((defect / (AIM * DEFECT)) ** (1 / (1 + len(mesh.c)))).astype(int)
-        pieces = np.where(defect > DEFECT, np.clip(pieces, 2, MOST_PIECES), 1)
+        pieces = np.maximum(1, np.ceil((defect / DEFECT) ** (1 / (1 + len(mesh.c)))).astype(int))
         if pieces.max() == 1 or pieces.sum() > MOST_INTERVALS:
             return None
         finer = Mesh(subdivided(mesh.edges, pieces), mesh.order)

@@ -11,7 +11,7 @@ from math import comb
 import casadi as ca
 import numpy as np
 
-from servoctl.control.nonlinear import NonlinearProgram
+from servoctl.control.nonlinear import solver
 from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
 from servoctl.values import frozen
@@ -86,9 +86,7 @@ class Mesh:
     @property
     def weights(self):
         """Weights of the nodes in integrals over time, (N s,) array [s]."""
-        s = len(self.c)
-        at_nodes = np.linalg.solve(np.vander(self.c, s, increasing=True).T, 1.0 / np.arange(1, s + 1))
-        return (self.h[:, None] * at_nodes).ravel()
+        return (self.h[:, None] * np.linalg.inv(radau(self.order)[1])[-1]).ravel()
 
     def place(self, t):
         """The interval of each instant (M,), and its place in it from 0 to 1."""
@@ -154,7 +152,7 @@ class Transcription:
         self.node, self.mesh, self.pieces, self.sizes, self.start, self.rest = node, mesh, pieces, sizes, start, rest
         w, beta, objective, self._constraints = self._problem()
         g = ca.vertcat(*(ca.vec(value) for value in self._constraints.values()))
-        self._program = NonlinearProgram({"x": w, "p": beta, "f": objective, "g": g})
+        self._solver = solver({"x": w, "p": beta, "f": objective, "g": g})
 
     @cached_property
     def watched(self):
@@ -207,21 +205,17 @@ class Transcription:
         x, points = x.reshape(len(of_states), -1, order="F"), points.reshape(len(of_inputs), -1, order="F")
         return x * of_states, points * of_inputs
 
-    def solve(self, w, beta, sides, multipliers=None):
-        """Variables w (n_w,), multipliers and statistics of the solution that is found from an approximation w.
+    def solve(self, w, beta, sides):
+        """Variables w (n_w,) of the solution that is found from an approximation w, and IPOPT's statistics.
 
         `beta` (k,) divides the squares of the residuals. `sides` are lower and upper ones (2, rows, instants) of the
-        states "x", of the control points "u", and of constraints by kind; others vanish. Multipliers are pairs, of
-        bounds and of constraints; those passed are of a nearby solution, where this one begins.
+        states "x", of the control points "u", and of constraints by kind; others vanish.
         """
         lower, upper = (self.joined(sides["x"][i], sides["u"][i]) for i in (0, 1))
         kinds = [sides.get(kind, np.zeros((2, *value.shape))) for kind, value in self._constraints.items()]
         lower_g, upper_g = (np.concatenate([side[i].ravel(order="F") for side in kinds]) for i in (0, 1))
-        start = {} if multipliers is None else {"lam_x0": multipliers[0], "lam_g0": multipliers[1]}
-        found, stats = self._program.solve(
-            bool(start), x0=w, p=beta, lbx=lower, ubx=upper, lbg=lower_g, ubg=upper_g, **start
-        )
-        return found["x"], (found["lam_x"], found["lam_g"]), stats
+        found = self._solver(x0=w, p=beta, lbx=lower, ubx=upper, lbg=lower_g, ubg=upper_g)
+        return np.array(found["x"]).ravel(), self._solver.stats()
 
 
 def _each(sizes, count):
