@@ -54,9 +54,9 @@ FIRST = 1e-3  # first weight, relative to that for which standing still costs as
 DEFAULT = 1e-6  # default weight, relative to the same
 FACTOR = 100.0  # between the weights of two successive solutions
 COARSE = 1e-6  # defect with which no plan is returned
-DEFECT = 1e-7  # of the states between nodes, relative to their sizes, above which an interval is cut
+DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes; and what refinement aims at of it
 PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
-ROUNDS, MOST_INTERVALS = 6, 400  # of the mesh
+ROUNDS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
 SAMPLES = 1000  # of the run, at least
 OPEN = (-np.inf, np.inf)
 
@@ -365,7 +365,8 @@ class Relaxation(Transfer):
     def _finer(self, plan):
         """The plan on a finer mesh where its motion is not that of the plant; None where it is, or at the finest."""
         mesh, defect = plan.mesh, self._defects(plan)
-        pieces = np.maximum(1, np.ceil((defect / DEFECT) ** (1 / (1 + len(mesh.c)))).astype(int))
+        pieces = np.ceil((defect / (AIM * DEFECT)) ** (1 / (1 + len(mesh.c)))).astype(int)
+        pieces = np.where(defect > DEFECT, np.clip(pieces, 2, MOST_PIECES), 1)
         if pieces.max() == 1 or pieces.sum() > MOST_INTERVALS:
             return None
         finer = Mesh(subdivided(mesh.edges, pieces), mesh.order)
