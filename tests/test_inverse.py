@@ -13,8 +13,8 @@ from test_bounded import aircraft, arm, flexible_link
 from test_report import DRIFTING, FLAT, KINKS, RESTING, beside, cart, crane, mathieu
 
 import servoctl as sv
+from servoctl.control.nonlinear import IPOPT
 from servoctl.gallery import gallery, overhead_crane
-from servoctl.inversion.transcription import IPOPT
 
 
 def specification(model):

@@ -11,11 +11,12 @@ from scipy.optimize import approx_fprime
 from test_bounded import flexible_link
 
 import servoctl as sv
+from servoctl.control.nonlinear import IPOPT, LONGEST
 from servoctl.control.reference import resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, NameUnknown, SpecificationError
 from servoctl.gallery import overhead_crane
 from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST, Relaxation
-from servoctl.inversion.transcription import IPOPT, LONGEST, WATCHED, Mesh, Transcription, bernstein
+from servoctl.inversion.transcription import WATCHED, Mesh, Transcription, bernstein
 from servoctl.study.load import load
 
 rest_to_rest = sv.paths.rest_to_rest
@@ -345,7 +346,7 @@ def test_the_plant_follows_the_plan(scene):
 def test_stiff_machines_are_solved_in_a_few_iterations():
     """Eight segments, the first solution, with modes of 650 rad/s in intervals of 0.09 s."""
     mechanism, program = flexible_link(8)
-    relaxation = Relaxation(sv.plant(mechanism), program, (0.0, 2.2), ({}, {}), None, None, "rest")
+    relaxation = Relaxation(sv.plant(mechanism), program, (0.0, 2.2), {}, None, None, "rest")
     plan = relaxation._solved(relaxation._first(relaxation._mesh()), [FIRST * relaxation._usual_weights()])
     assert plan.iterations[0] <= 5
 
@@ -492,14 +493,13 @@ def test_bernstein_polynomials_and_their_derivatives():
     assert bernstein(5, np.array([0.3]), 1)[0] == pytest.approx(slopes[0], abs=1e-5)
 
 
-def test_control_points_give_values_at_nodes_and_integrals_are_exact():
+def test_control_points_give_lines_and_integrals_are_exact():
     mesh = Mesh(np.array([0.0, 0.5, 2.0]), 9)
-    values = np.sin(mesh.nodes)[None]
-    points = mesh.control_points(values, [0.0])
-    assert mesh.inputs(points, mesh.nodes) == pytest.approx(values, abs=1e-13)
+    points = 3.0 * mesh.places_of_points[None]
+    assert points @ mesh.of_inputs(mesh.nodes) == pytest.approx(3.0 * mesh.nodes[None], abs=1e-13)
     assert mesh.weights @ mesh.nodes**8 == pytest.approx(2.0**9 / 9, rel=1e-14)
     powers = mesh.power_coefficients(points)[:, 1, 0]
-    assert np.polyval(powers[::-1], 0.25) == pytest.approx(mesh.inputs(points, np.array([0.5 + 1.5 * 0.625]))[0, 0])
+    assert np.polyval(powers[::-1], 0.25) == pytest.approx((points @ mesh.of_inputs(np.array([0.5 + 1.5 * 0.625])))[0, 0])
 
 
 def test_weights_fall_by_the_factor_from_the_first_to_the_last(monkeypatch, crane):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from servoctl.checks import as_span, finite, interval, mapping, require_kind
+from servoctl.control.extremes import excesses, extremes
 from servoctl.control.time_optimal import Curve, Inverse, Problem, smooth
 from servoctl.errors import (
     InconsistentStart,
@@ -30,7 +31,6 @@ from servoctl.values import frozen
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
 BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
 TIGHTENED, TIGHTER = 5, 1.2  # how often a time-optimal law is solved; limits at nodes give way by this many excesses
-SHORT = 1e-6  # of the span: intervals of samples that are too short for a difference quotient
 REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
 
@@ -121,10 +121,15 @@ def fastest(
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     require_kind(Program, "program", program, "sv.Program({...})")
+    limits = mapping(limits, "The limits")
+    if not limits:
+        raise SpecificationError(
+            "There are no limits.", "The fastest time law reaches a limit.", do='Pass some, as {"trolley": 100.0}.'
+        )
     scene = _Scene(
         needed(mechanism, program, named=[name for given in (limits, start, guess) for name in names_of(given)]),
         program,
-        {name: interval(name, value, "limit") for name, value in mapping(limits, "The limits").items()},
+        {name: interval(name, value, "limit") for name, value in limits.items()},
         as_span(t_span, forward=True),
         {name: finite(name, value, "start value") for name, value in mapping(start, "The start values").items()},
         guess,
@@ -141,7 +146,8 @@ def _even(scene, bar):
     @functools.cache
     def attempt(factor):
         try:
-            return scene.slowed(factor)
+            slower = scene.program.slowed(scene.mechanism.q, factor, at=scene.t_span[0])
+            return scene.tried(slower, factor)
         finally:
             bar.update()
 
@@ -169,24 +175,33 @@ def _optimal(scene, bar):
     @functools.cache
     def attempt(factor):
         step = rest_to_rest(t - t0, 0.0, 1.0, (t1 - t0) * factor, inverse.order)
-        found = scene.along(curve, step, (t1 - t0) * factor)
+        found = scene.tried(curve.program_along(step), factor)
         bar.update()
-        _require_stable(found[-1])
+        if found[-1] is not None and not found[-1].model.flat:
+            require_no_growth(
+                found[-1],
+                "curve",
+                "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
+                "Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
+            )
         return found
 
     _, slow = _bracket(attempt)
     law, plan = smooth((t1 - t0) * slow, inverse.order), attempt(slow)[-1]
-    sides = np.array([*scene.limits.values()]).T
+    limits = np.array([*scene.limits.values()]).T
+    sides = limits.copy()
     for _ in range(TIGHTENED):
         law = Problem(inverse, sides, law, plan).solved()
-        excess, binding, program, plan = scene.along(curve, law.expression(t, t0), law.duration)
+        excess, binding, program, plan = scene.tried(
+            curve.program_along(law.expression(t, t0)), law.duration / (t1 - t0)
+        )
         bar.update()
         if excess <= 0:
             return TimeLaw(law.duration / (t1 - t0), program, plan if plan.model.flat else judged(plan), binding)
         if plan is None:
             break
-        beyond = [[max(0.0, e) for e in _excesses(plan, name, *scene.limits[name])] for name in scene.limits]
-        sides += TIGHTER * np.array(beyond).T * [[1.0], [-1.0]]
+        values = np.array([[value for value, _ in extremes(plan, name)] for name in scene.limits]).T
+        sides += TIGHTER * np.clip(limits - values, [[0.0], [-np.inf]], [[np.inf], [0.0]])
         if np.any(sides[0] >= sides[1]):
             break
     raise LimitExceeded(
@@ -210,22 +225,8 @@ class _Scene:
     guess: dict
     parameters: dict
 
-    def __post_init__(self):
-        if not self.limits:
-            raise SpecificationError(
-                "There are no limits.", "The fastest time law reaches a limit.", do='Pass some, as {"trolley": 100.0}.'
-            )
-
-    def slowed(self, factor):
+    def tried(self, slower, factor):
         """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""
-        return self._tried(self.program.slowed(self.mechanism.q, factor, at=self.t_span[0]), factor)
-
-    def along(self, curve, law, duration):
-        """The same of a law along the curve, an SX scalar."""
-        t0, t1 = self.t_span
-        return self._tried(curve.program_along(law), duration / (t1 - t0))
-
-    def _tried(self, slower, factor):
         t0, t1 = self.t_span
         try:
             model = derived(self.mechanism, slower, self.guess)
@@ -235,7 +236,8 @@ class _Scene:
             plan = simulated(model, start, (t0, t0 + (t1 - t0) * factor), progress=False)
         except (SingularProgram, InconsistentStart, IntegrationStopped):
             return np.inf, ("", "", t0), slower, None
-        return *_worst(plan, self.limits), slower, plan
+        excess, name, side, t, *_ = max(excesses(plan, self.limits))
+        return excess, (name, side, t), slower, plan
 
 
 def _bracket(attempt):
@@ -247,45 +249,6 @@ def _bracket(attempt):
         if (attempt(factor)[0] > -BELOW) != (step > 1):
             return min(before, factor), max(before, factor)
     raise _unreached(factor) if step < 1 else _exceeded(attempt(factor), factor)
-
-
-def _worst(plan, limits):
-    """Largest excess over the limits, relative to their size, and its (signal, side, instant)."""
-    excesses = []
-    for name, (low, high) in limits.items():
-        (t_low, least), (t_high, most) = _extrema_of(plan, name)
-        size = max(abs(v) for v in (low, high) if np.isfinite(v)) or max(abs(least), abs(most)) or 1.0
-        below, above = _excesses(plan, name, low, high)
-        excesses += [(below / size, (name, "lower", t_low)), (above / size, (name, "upper", t_high))]
-    return max(excesses)
-
-
-def _excesses(plan, name, low, high):
-    """By how much a signal exceeds its lower and its upper limit."""
-    (_, least), (_, most) = _extrema_of(plan, name)
-    return low - least, most - high
-
-
-def _extrema_of(plan, name):
-    """((t, least), (t, most)) of a signal or a rate."""
-    if not _differenced(plan, name):
-        return plan.extrema(name)
-    t, rates = _values(plan, name)
-    return tuple((float(t[i]), float(rates[i])) for i in (np.argmin(rates), np.argmax(rates)))
-
-
-def _differenced(plan, name):
-    """Whether a name is that of a rate that is taken from the samples at both ends of intervals."""
-    return name not in plan.names and name[:1] == "d" and name[1:] in plan.names
-
-
-def _values(plan, name):
-    """Times and values of a signal or a rate."""
-    if not _differenced(plan, name):
-        return plan.t, plan[name]
-    whole = np.append(True, np.diff(plan.t) > SHORT * np.ptp(plan.t))
-    t, values = plan.t[whole], plan[name[1:]][whole]
-    return t[:-1], np.diff(values) / np.diff(t)
 
 
 def _level(model, name):
@@ -303,17 +266,12 @@ def _unreached(factor):
     )
 
 
-def _require_stable(plan):
-    """Refuse a plan, if there is one, along which errors of the internal dynamics grow."""
-    if plan is None or plan.model.flat:
-        return
+def require_no_growth(plan, where, rule, do):
+    """Refuse a motion along which errors of what the program leaves free grow."""
     internal = internal_dynamics(plan)
     if internal.verdict == "unstable":
         raise UnstableInternalDynamics(
-            f"Along the curve {internal.sentence()}.",
-            "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
-            do="Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
-            growth=float(internal.growth),
+            f"Along the {where} {internal.sentence()}.", rule, do=do, growth=float(internal.growth)
         )
 
 

@@ -10,14 +10,16 @@ Entries of the state that the rows leave free, the internal dynamics, are colloc
 """
 
 from copy import copy
-from functools import cached_property
-from math import comb, factorial
+from math import factorial
 
 import casadi as ca
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from servoctl.checks import antiderivative
+from servoctl.control.nonlinear import solver, words
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
+from servoctl.methods.bounded import FreeEntries, subdivided
 from servoctl.methods.radau import radau
 from servoctl.model.model import derived
 from servoctl.spec.paths import piecewise
@@ -30,18 +32,7 @@ REGULAR = 1e-3  # least speed along a curve, of the largest, with which time its
 DEGREES = (1, 2, 4, 8, 12, 16, 20)  # of the polynomial of the arc length that a curve is, or else
 SPLINE = (9, 80)  # the degree and the intervals of its spline
 MISSED = (1e-12, 1e-8)  # of its extent: by which the polynomial, and the spline, may miss it
-PANELS, GAUSS = 2000, np.polynomial.legendre.leggauss(8)  # of the quadrature of the arc length
-NEWTON_STEPS = 4  # to the instant of an arc length, from its secant
-IPOPT = {
-    "print_level": 0,
-    "sb": "yes",
-    "tol": 1e-8,
-    "acceptable_tol": 1e-6,
-    "max_iter": 500,
-    "bound_relax_factor": 0.0,
-    "nlp_scaling_method": "none",
-    "mu_strategy": "adaptive",
-}
+PANELS, GAUSS = 2000, np.polynomial.legendre.leggauss(8)  # of the arc length; of a quadrature in each panel
 LEAST = 1e-4  # duration, relative to that of the first motion
 
 
@@ -100,52 +91,35 @@ class Curve:
         return tuple(np.array(part) for part in self._offsets.map(len(t))(np.asarray(t, dtype=float)[None]))
 
     def _by_arc_length(self):
-        """Ends of pieces (n + 1,) in s and coefficients (degree + 1, n, k), as for `paths.piecewise`."""
-        from scipy.interpolate import make_interp_spline
+        """Ends of pieces (n + 1,) in s and coefficients (degree + 1, n, k), as for `paths.piecewise`.
 
-        places = self._by_length
-        check = np.linspace(0.0, 1.0, 403)[1:-1]
-        known = places(check)
+        Polynomials are fitted to the places at the ends of panels of time, whose parts of the length are known.
+        """
+        from scipy.interpolate import BSpline
+
+        panels = np.linspace(*self.span, PANELS + 1)
+        t, weights = quadrature(self.span, PANELS)
+        length = np.append(0.0, np.cumsum((self._speed(t) * weights).reshape(PANELS, -1).sum(axis=1)))
+        part, places = length / length[-1], self._along(panels)[0].T
         for degree in DEGREES:
-            y = -np.cos(np.pi * (2 * np.arange(degree + 1) + 1) / (2 * degree + 2))
-            fit = chebyshev.chebfit(y, places((1 + y) / 2), degree)
-            if (np.abs(chebyshev.chebval(2 * check - 1, fit).T - known) / self.extent).max() < MISSED[0]:
+            fit = chebyshev.chebfit(2 * part - 1, places, degree)
+            if (np.abs(chebyshev.chebval(2 * part - 1, fit).T - places) / self.extent).max() < MISSED[0]:
                 powers = np.array([np.pad(p := chebyshev.cheb2poly(c), (0, degree + 1 - len(p))) for c in fit.T])
                 return np.array([0.0, 1.0]), powers.T[:, None, :]
         degree, count = SPLINE
-        s = np.linspace(0.0, 1.0, count + 1)
-        curve = make_interp_spline(s, places(s), k=degree)
-        miss = np.abs(curve(check) - known) / self.extent
+        s, half = np.linspace(0.0, 1.0, count + 1), 0.5 / count
+        knots = np.pad(s, degree, mode="edge")
+        matrix = BSpline.design_matrix(part, knots, degree).toarray()
+        curve = BSpline(knots, np.linalg.lstsq(matrix, places, rcond=None)[0], degree)
+        miss = np.abs(curve(part) - places) / self.extent
         if not miss.max() < MISSED[1]:
             k, i = np.unravel_index(np.argmax(miss), miss.shape)
-            raise self._refused(list(self.moving)[i], f"turns sharply at {check[k]:.3g} of the length of its curve")
-        half = 0.5 / count
+            raise self._refused(list(self.moving)[i], f"turns sharply at {part[k]:.3g} of the length of its curve")
         coefficients = [curve(s[:-1] + half, nu=j) / factorial(j) * half**j for j in range(degree + 1)]
         return s, np.array(coefficients)
 
     def _speed(self, t):
         return np.linalg.norm(self._along(t)[1] / self.extent[:, None], axis=0)
-
-    @cached_property
-    def _lengths(self):
-        """The length of the curve at the ends of panels of time, each (PANELS + 1,)."""
-        panels = np.linspace(*self.span, PANELS + 1)
-        t = panels[:-1, None] + np.diff(panels)[:, None] * (1 + GAUSS[0]) / 2
-        pieces = self._speed(t.ravel()).reshape(t.shape) @ GAUSS[1] * np.diff(panels) / 2
-        return panels, np.append(0.0, np.cumsum(pieces))
-
-    def _by_length(self, s):
-        """Places (M, k) of the curve at parts s (M,) of its length, by Newton's method in the panel of each."""
-        panels, length = self._lengths
-        target = np.asarray(s) * length[-1]
-        k = np.clip(np.searchsorted(length, target, side="right") - 1, 0, PANELS - 1)
-        t = np.interp(target, length, panels)
-        for _ in range(NEWTON_STEPS):
-            half = (t - panels[k]) / 2
-            inside = self._speed((panels[k, None] + half[:, None] * (1 + GAUSS[0])).ravel()).reshape(len(t), -1)
-            miss, speed = length[k] + half * (inside @ GAUSS[1]) - target, self._speed(t)
-            t = np.clip(t - np.divide(miss, speed, out=np.zeros_like(t), where=speed > 0), panels[k], panels[k + 1])
-        return self._along(t)[0].T
 
     def program_along(self, law):
         """The program whose curve is followed by a law s, an SX scalar from 0 to 1."""
@@ -190,7 +164,7 @@ class Inverse:
         numbers = ca.DM([0.0, *model.parameters[:-JETS]])
         tops, *parts = ca.substitute(parts, [ca.vertcat(t, *e.parameters.elements()[:-JETS])], [ca.SX(numbers)])
         self.order, highest = (max(j for j in range(JETS) if ca.depends_on(x, c[j])) for x in (tops, parts[0]))
-        self.c, self.state, self.free = ca.vertcat(*c[: highest + 1]), e.state.numel(), model.free
+        self.c = ca.vertcat(*c[: highest + 1])
         self.function = ca.Function("inverse", [self.jets, self.c], [ca.densify(ca.cse(part)) for part in parts])
 
     def _signal(self, name):
@@ -200,29 +174,49 @@ class Inverse:
         if name in model.jet_names:
             i = model.jet_names.index(name)
             return 0, ca.Function("jet", [e.q.t, e.jets, e.parameters], [e.jets[i]])
-        for rate, prefix in enumerate(("", "d")):
-            base = name[len(prefix) :]
-            if name.startswith(prefix) and base in model.signal_groups:
-                names, f = e.signals(model.signal_groups[base], rate)
-                return names.index(name), f
-        raise unknown(name, [*model.jet_names, *model.signal_groups], "signal")
+        base, rate = (
+            (name, 0) if name in model.signal_groups else antiderivative(name, model.signal_groups) or (None, 0)
+        )
+        if base is None:
+            raise unknown(name, [*model.jet_names, *model.signal_groups], "signal")
+        names, f = e.signals(model.signal_groups[base], rate)
+        return names.index(name), f
 
 
 @frozen
 class Law:
-    """A law s(t): s^(k) at the ends of N equal intervals of a duration, between which it is linear."""
+    """A law s(t): s^(k) T^k at the ends of N equal intervals of a duration T, between which it is linear."""
 
-    duration: float  # T [s]
-    jets: np.ndarray  # (k + 1, N + 1): s, s' T, ..., s^(k) T^k
+    duration: float  # [s]
+    top: np.ndarray  # (N + 1,)
+    k: int
+
+    @property
+    def ends(self):
+        """Ends of the intervals (N + 1,) in parts of the duration."""
+        return np.linspace(0.0, 1.0, len(self.top))
+
+    def jets(self, parts):
+        """s, s' T, ..., s^(k+1) T^(k+1) at parts (M,) of the duration: (k + 2, M)."""
+        from scipy.interpolate import BSpline
+
+        linear = BSpline(np.pad(self.ends, 1, mode="edge"), self.top, 1)
+        below = [linear.antiderivative(self.k - j)(parts) for j in range(self.k)]
+        return np.array([*below, linear(parts), linear(parts, nu=1)])
 
     def expression(self, t, t0):
         """s as an SX of a time that begins at t0 [s]; before and after it rests."""
-        k, count = len(self.jets) - 1, self.jets.shape[1] - 1
-        begins = np.vstack([self.jets[:, :-1], np.diff(self.jets[-1:]) * count])
-        powers = np.array([begins[j] / (count**j * factorial(j)) for j in range(k + 2)])
-        about_middle = np.array([[comb(j, i) / 2**j if i <= j else 0.0 for j in range(k + 2)] for i in range(k + 2)])
-        times = t0 + self.duration * np.linspace(0.0, 1.0, count + 1)
-        return piecewise(ca.fmin(ca.fmax(t, times[0]), times[-1]), times, (about_middle @ powers)[:, :, None])
+        half, times = 0.5 / (len(self.top) - 1), t0 + self.duration * self.ends
+        jets = self.jets(self.ends[:-1] + half)
+        powers = np.array([jet * half**j / factorial(j) for j, jet in enumerate(jets)])
+        return piecewise(ca.fmin(ca.fmax(t, times[0]), times[-1]), times, powers[:, :, None])
+
+
+def quadrature(edges, panels):
+    """Instants (N,) [s] and weights (N,) of a quadrature over pieces, in about so many panels of eight nodes."""
+    ends = subdivided(edges, np.ceil(panels * np.diff(edges) / np.ptp(edges)).astype(int))
+    half = np.diff(ends)[:, None] / 2
+    return (ends[:-1, None] + half * (1 + GAUSS[0])).ravel(), (half * GAUSS[1]).ravel()
 
 
 def taylor(rows, k, step):
@@ -231,29 +225,15 @@ def taylor(rows, k, step):
     return np.array([[powers[j - i] if j >= i else 0.0 for j in range(k + 2)] for i in range(rows)])
 
 
-def resting(top, k):
-    """Values (N + 1,) of s^(k) nearest to these whose integrals go from rest at s = 0 to rest at s = 1."""
-    count = len(top) - 1
-
-    def integrals(values):
-        state = np.zeros((k + 1, values.shape[1]))
-        state[k] = values[0]
-        for slopes in np.diff(values, axis=0) * count:
-            state = taylor(k + 1, k, 1.0 / count) @ np.vstack([state, slopes])
-        return state
-
-    fixed = np.array(top, dtype=float)
-    fixed[[0, -1]] = 0.0
-    ends = integrals(np.eye(count + 1))[:k, 1:-1]
-    size = np.abs(ends).sum(axis=1, keepdims=True)
+def resting(duration, top, k):
+    """The law whose s^(k), with values nearest to these (N + 1,), leads from rest at s = 0 to rest at s = 1."""
+    fixed, end = np.append(0.0, np.append(top[1:-1], 0.0)), np.ones(1)
+    at_end = Law(duration, np.eye(len(top)), k).jets(end)[:k, 0, 1:-1]
+    size = np.abs(at_end).sum(axis=1)
     for _ in range(2):
-        miss = np.eye(k)[:, 0] - integrals(fixed[:, None])[:k, 0]
-        fixed[1:-1] += np.linalg.lstsq(ends / size, miss / size[:, 0], rcond=None)[0]
-    jets = np.zeros((k + 1, count + 1))
-    for i, slope in enumerate(np.diff(fixed) * count):
-        jets[k, i] = fixed[i]
-        jets[:, i + 1] = taylor(k + 1, k, 1.0 / count) @ np.append(jets[:, i], slope)
-    return jets
+        miss = np.eye(k)[0] - Law(duration, fixed, k).jets(end)[:k, 0]
+        fixed[1:-1] += np.linalg.lstsq(at_end / size[:, None], miss / size, rcond=None)[0]
+    return Law(duration, fixed, k)
 
 
 def _each(sizes, count):
@@ -261,12 +241,10 @@ def _each(sizes, count):
 
 
 def smooth(duration, k):
-    """The law of a given duration [s] and class that is a polynomial, `paths.rest_to_rest`."""
+    """The law of a given duration [s] and class that is nearly a polynomial, `paths.rest_to_rest`."""
     step = np.polynomial.Polynomial([0.0, 1.0])
-    bump = (step * (1 - step)) ** k
-    jets = [(whole := bump.integ()) / whole(1.0)]
-    jets += [jets[0].deriv(j) for j in range(1, k + 1)]
-    return Law(duration, np.array([jet(np.linspace(0.0, 1.0, INTERVALS + 1)) for jet in jets]))
+    place = ((step * (1 - step)) ** k).integ()
+    return resting(duration, place.deriv(k)(np.linspace(0.0, 1.0, INTERVALS + 1)) / place(1.0), k)
 
 
 class Problem:
@@ -280,46 +258,36 @@ class Problem:
     def __init__(self, inverse, limits, law, plan):
         self.inverse, self.limits, self.law, self.k = inverse, np.array(limits), law, inverse.order
         self.c, self.rate, *_ = radau(COLLOCATION)
-        self.count = law.jets.shape[1] - 1
-        begins = np.arange(self.count)[:, None]
-        nodes = plan.t[0] + law.duration * (begins + self.c).ravel() / self.count
-        size = inverse.jets.numel()
-        times = np.append(plan.t[0], nodes)
+        self.count, size = len(law.top) - 1, inverse.jets.numel()
+        self.parts = (np.arange(self.count)[:, None] + self.c).ravel() / self.count  # of the duration, at nodes
+        times = plan.t[0] + law.duration * np.append(0.0, self.parts)
         jets = np.array([np.interp(times, plan.t, row) for row in plan.jets])
         jets = jets[:size] if len(jets) >= size else plan.model.extended(times, jets, size)
         self.begin, self.z = jets[:, 0], jets[:, 1:]
+        start = plan.jets[: len(plan.model.state_names), 0]
+        self.free = [] if plan.model.flat else FreeEntries(plan.model, plan.t[0], start).free.tolist()
         self._measure()
 
     def _measure(self):
-        """Sizes of the unknowns, of the rows and of the signals; and the free entries of the state."""
-        from scipy.linalg import qr
-
-        inverse, z = self.inverse, self.z
-        self.sizes = np.maximum(np.abs(self.law.jets).max(axis=1), 1e-300)
+        """Sizes of the unknowns, of the rows and of the signals."""
+        inverse, z, law, rows = self.inverse, self.z, self.law, self.inverse.c.numel()
+        self.s = law.jets(law.ends)[: self.k + 1]
+        self.sizes = np.maximum(np.abs(self.s).max(axis=1), 1e-300)
         largest = np.abs(z).max(axis=1)
         self.z_size = np.where(largest > 1e-6 * largest.max(), largest, 1.0)
-        at = self._places(self.law)
+        at = np.pad(law.jets(self.parts), ((0, rows), (0, 0)))[:rows] / law.duration ** np.arange(rows)[:, None]
         f, of = inverse.function, (inverse.jets, inverse.c)
         J = ca.Function("slopes", [*of], [ca.densify(ca.jacobian(f(*of)[0], inverse.jets))])
         slopes = np.array([np.array(J(z[:, i], at[:, i])) * self.z_size for i in range(z.shape[1])])
         self.row_size = np.abs(slopes).max(axis=(0, 2))
         values = np.array(f.map(z.shape[1])(z, at)[1])
         self.value_size = np.maximum(np.abs(values).max(axis=1), 1e-300)
-        count = inverse.free
-        tangents = np.linalg.svd(slopes / self.row_size[:, None])[2][:, z.shape[0] - count :, : inverse.state]
-        self.free = np.sort(qr(np.concatenate(tangents), pivoting=True)[2][:count]) if count else np.arange(0)
 
     def _stages(self, jets):
         """s, s' T, ... (rows, N) at each stage."""
         k, rows = self.k, self.inverse.c.numel()
         stack = ca.vertcat(jets[:, :-1], (jets[k, 1:] - jets[k, :-1]) * self.count)
         return [ca.DM(taylor(rows, k, theta / self.count)) @ stack for theta in self.c]
-
-    def _places(self, law):
-        """c (rows, N S) at the nodes."""
-        stages = np.array([np.array(stage) for stage in self._stages(ca.DM(law.jets))])
-        scaled = stages / law.duration ** np.arange(stages.shape[1])[:, None]
-        return scaled.transpose(1, 2, 0).reshape(stages.shape[1], -1)
 
     def solved(self):
         """The time-optimal law."""
@@ -328,22 +296,22 @@ class Problem:
         jets = ca.diag(ca.DM(self.sizes)) @ s
         equal, values = self._constraints(T * self.law.duration, jets, ca.diag(ca.DM(self.z_size)) @ z)
         problem = {"x": ca.veccat(T, s, z), "f": T, "g": ca.vertcat(equal, values)}
-        solver = ca.nlpsol("time_optimal", "ipopt", problem, {"print_time": False, "ipopt": IPOPT})
         zeros, free = np.zeros(equal.numel()), np.full(z.numel(), np.inf)
         sides = [np.tile(side / self.value_size, values.numel() // max(len(side), 1)) for side in self.limits]
-        first = [(self.law.jets / self.sizes[:, None]).ravel("F"), (self.z / self.z_size[:, None]).ravel("F")]
-        result = solver(
+        first = [(self.s / self.sizes[:, None]).ravel("F"), (self.z / self.z_size[:, None]).ravel("F")]
+        search = solver(problem)
+        result = search(
             x0=np.concatenate([[1.0], *first]),
             lbx=np.concatenate([[LEAST], self._sides(0), -free]),
             ubx=np.concatenate([[np.inf], self._sides(1), free]),
             lbg=np.concatenate([zeros, sides[0]]),
             ubg=np.concatenate([zeros, sides[1]]),
         )
-        w, stats = np.array(result["x"]).ravel(), solver.stats()
-        if not stats["success"]:
-            raise _failed(stats)
+        if words(search.stats()):
+            raise _failed(search.stats())
+        w = np.array(result["x"]).ravel()
         top = w[1 : 1 + s.numel()].reshape(s.shape, order="F")[k] * self.sizes[k]
-        return Law(w[0] * self.law.duration, resting(top, k))
+        return resting(w[0] * self.law.duration, top, k)
 
     def _constraints(self, duration, jets, motion):
         """What vanishes, and the signals in their sizes, all as columns."""
@@ -358,7 +326,7 @@ class Problem:
             equal.append(rows / _each(self.row_size, N))
             values.append(value / _each(self.value_size, N))
             rates.append(rate)
-        for i in self.free.tolist():
+        for i in self.free:
             x = ca.vertcat(*(motion[i, j::S] for j in range(S)))
             begin = ca.horzcat(ca.MX(self.begin[i]), x[-1, :-1])
             rate = ca.vertcat(*(rate[i, :] for rate in rates))
@@ -377,11 +345,10 @@ class Problem:
 
 
 def _failed(stats):
-    status = stats["return_status"]
     return IntegrationStopped(
-        f"IPOPT ends with {status} after {stats['iter_count']} iterations.",
+        f"IPOPT {words(stats)}, after {stats['iter_count']} iterations.",
         "A time-optimal law is a minimum of the duration.",
         do="Choose wider limits, a simpler curve, or shape=False.",
-        status=status,
+        status=stats["return_status"],
         iterations=stats["iter_count"],
     )

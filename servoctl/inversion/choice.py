@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.checks import as_span, by_name, interval, mapping, numbers_by_name, positive_number, require_kind
+from servoctl.checks import as_span, by_name, interval, mapping, require_kind
+from servoctl.control.extremes import excesses
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -15,8 +16,7 @@ from servoctl.errors import (
     SpecificationError,
     warn,
 )
-from servoctl.inversion.relaxed import relaxed
-from servoctl.inversion.report import extremes
+from servoctl.inversion.relaxed import relaxed, weights_of
 from servoctl.inversion.transfer import Near, rests
 from servoctl.inversion.verdict import (
     FLAT,
@@ -117,7 +117,8 @@ def inverse(
     require_kind(Program, "program", program, "sv.Program({...})")
     span, ranges = as_span(t_span, forward=True), _ranges(mechanism, limits, bounds)
     mechanism = needed(mechanism, program, named=[*names_of(start), *ranges[0], *ranges[1]])
-    request = Request(mechanism, program, span, start, ranges, _checked(weight, program))
+    weights_of(weight, program)  # refused now, whether it will be needed or not
+    request = Request(mechanism, program, span, start, ranges, weight)
     known = None if isinstance(start, State) else mapping(start, "The start")
     by_hand = method if method is None or isinstance(method, str) and method == RELAXED else as_method(method)
     try:
@@ -245,13 +246,6 @@ def _ranges(mechanism, limits, bounds):
     )
 
 
-def _checked(weight, program):
-    """A weight, or weights by residual, that are positive."""
-    if isinstance(weight, Mapping):
-        return numbers_by_name(weight, program.names, "residual", "weight", positive=True)
-    return None if weight is None else positive_number("weight", weight)
-
-
 def _begin(model, start, t):
     """The given start, or one near its values; None where there is none, as at a singular rest."""
     if isinstance(start, State):
@@ -288,12 +282,11 @@ def _by_hand(request, model, begin, found, chosen, method):
 
 def _excess(run, ranges):
     """What of a run lies beyond its ranges, in words; "" if nothing does."""
-    for name, (low, high) in ranges.items():
-        for value, t in extremes(run, name):
-            if not low <= value <= high:
-                limit = low if value < low else high
-                return f"the exact plan needs {name} = {value:.6g} at t = {t:.4g} s, and the limit is {limit:g}"
-    return ""
+    if not ranges:
+        return ""
+    excess, name, _, t, value, limit = max(excesses(run, ranges))
+    beyond = f"the exact plan needs {name} = {value:.6g} at t = {t:.4g} s, and the limit is {limit:g}"
+    return beyond if excess > 0 else ""
 
 
 def _with_reason(run, why, note=""):

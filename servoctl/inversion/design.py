@@ -18,10 +18,10 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_list, by_name, finite, interval, mapping, named, numbers_by_name, require_kind, texts
-from servoctl.control.time_law import REACHED
-from servoctl.errors import LimitExceeded, ServoError, SpecificationError, UnstableInternalDynamics
-from servoctl.growth import internal_dynamics
-from servoctl.inversion.report import extremes
+from servoctl.control.extremes import excesses, extremes, rates, size_of_limit
+from servoctl.control.time_law import REACHED, require_no_growth
+from servoctl.control.time_optimal import quadrature
+from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.markup import Shown
 from servoctl.methods.choice import Bounded
@@ -35,17 +35,19 @@ from servoctl.verification import Verification, verify
 
 MINIMISED = ("rms", "peak", "time")
 FIRST_NODES = 100  # instants of the motion at which inequalities hold, before extrema between them are added
-SQUARE_PANELS, EIGHT_NODES = 32, np.polynomial.legendre.leggauss(8)  # of the quadrature; knots end panels
-MOST_PANELS = 1024  # with which jumps of the actuation between knots are integrated to a thousandth
-QUADRATURE = 1e-8  # of a mean square: error of its quadrature, beyond which it gets twice as many panels
+SQUARE_PANELS = 256  # of the quadrature; knots end panels
 SAFELY_INSIDE = 1e-6  # of a limit: by which it is stricter at nodes, and by which a peak may exceed that at nodes
-SEARCHES = 12  # of the search, each with more nodes or panels than the one before
-REGIONS = 30  # of one search, each in a smaller or larger region around the best motion
-SMALLEST_REGION = 1e-6  # of the ranges: region without a motion next to one with a motion
-QUADRATIC_PROGRAMS = 200  # of sequential quadratic programming in one region
+SEARCHES = 12  # of the search, each with more nodes than the one before
+APART = 1e-6  # of the motion: least distance of two nodes
+QUADRATIC_PROGRAMS = 200  # of sequential quadratic programming
 UNCHANGED = 1e-12  # change of the cost, relative to that before, with which sequential quadratic programming ends
 ACTIVE = 1e-5  # distance from an inequality, relative to the limit, within which it counts as met
 STATIONARY = 1e-4  # of the cost: largest gain across the ranges at a local minimum
+GROWS = (
+    "motion",
+    "A design is one of exact inverses: flat, bounded, or integrated forward where errors do not grow.",
+    "Begin and end the program with a dwell, or choose another output.",
+)  # where errors grow, the rule, and what to do
 PROBED = (0.1, 0.3)  # of the ranges: how far from a minimum less cost is looked for
 
 
@@ -177,10 +179,7 @@ def design(
     motions = Motions(model, tuple(ranges), _span(model, t_span, ranges), (mapping(start, "The start"), guess))
     with progress_bar("design", None, unit=" motions") as bar:
         motions.count = bar.update
-        try:
-            found = Search(motions, np.array(list(ranges.values())), minimise, sizes, limits).found()
-        except NoMotion as failure:
-            raise failure.error from None
+        found = Search(motions, np.array(list(ranges.values())), minimise, sizes, limits).found()
     if found.gain > STATIONARY:
         warnings.warn(f"The design is {found.message}.", RuntimeWarning, stacklevel=2)
     return found
@@ -249,13 +248,6 @@ def _span(model, t_span, ranges):
     return t0, ca.Function("end", [ca.vertcat(*inputs.values())], [end, ca.densify(slopes)])
 
 
-class NoMotion(Exception):
-    """Parameters `at` (k,) in units of their ranges, for which there is no motion, and the error that says why."""
-
-    def __init__(self, at, error):
-        self.at, self.error = at, error
-
-
 class Motions:
     """The motions of a model by its parameters.
 
@@ -279,7 +271,7 @@ class Motions:
         first = self.run(model)
         self.guess = dict(zip(model.state_names, np.asarray(first.start.values).tolist(), strict=False))
         if not model.flat and self.method is None:
-            _require_no_growth(model, first)
+            require_no_growth(first, *GROWS)
             free = sensitivity(first, model.state_names[0], names).independent
             self.held = {name: self.guess[name] for name in free}
         self.t1 = float(self.ends(self.numbers)[0])
@@ -295,6 +287,11 @@ class Motions:
         numbers = self.model.numbers | dict(zip(self.names, p, strict=True))
         t1, slopes = self.end(list(numbers.values()))
         return float(t1), np.array(slopes).ravel()
+
+    def window(self, p):
+        """First and last instant [s] of the motion, and derivatives of the last one (k,)."""
+        t1, slopes = self.ends(p)
+        return self.t0 - self.ahead, t1 + self.after, slopes
 
     def with_parameters(self, p):
         """The model with parameters p (k,)."""
@@ -318,70 +315,6 @@ class Motions:
         return simulated(model, begin, (self.t0, t1), self.method, t_eval=times, progress=False)
 
 
-def _require_no_growth(model, run):
-    """Refuse a motion that is integrated forward, along which errors grow."""
-    internal = internal_dynamics(run)
-    if internal.verdict == "unstable":
-        raise UnstableInternalDynamics(
-            f"Along the motion {internal.sentence()}.",
-            "A design is one of exact inverses: flat, bounded, or integrated forward where errors do not grow.",
-            do="Begin and end the program with a dwell, or choose another output.",
-            growth=float(internal.growth),
-        )
-
-
-def _derivatives_at(run, signals, picked):
-    """The time derivatives (s, N) of signals at some samples (N,), which are in order."""
-    parts = []
-    for first, end, model in run.variants or ((0, len(run.t), run.model),):
-        inside = picked[(picked >= first) & (picked < end)]
-        groups = {_rate_group(model, name) for name in signals if not _is_state_jet(model, name)}
-        functions = {group: model.signals(*group)[1] for group in groups}
-        size = max([len(model.jet_names) + model.n, *(f.n_x for f in functions.values())])
-        jets = model.extended(run.t[inside], run.jets[: len(model.jet_names), inside], size)
-        grids = {g: f.grid(run.t[inside], jets[: f.n_x], model.parameters) for g, f in functions.items()}
-        parts.append([_rate_row(model, name, jets, grids) for name in signals])
-    return np.concatenate(parts, axis=1)
-
-
-def _is_state_jet(model, name):
-    """Whether the derivative of a signal is another jet."""
-    return name in model.jet_names and (model.reduction.mechanism.q.plain or name not in model.coordinate_names)
-
-
-def _rate_group(model, name):
-    """The group of a signal's derivative, and its order there."""
-    return ("coordinate_rates", 0) if name in model.coordinate_names else (model.signal_groups[name], 1)
-
-
-def _rate_row(model, name, jets, grids):
-    """The derivative of a signal (N,) out of jets and groups of signals."""
-    if _is_state_jet(model, name):
-        return jets[model.jet_names.index(name) + model.n]
-    kind, order = _rate_group(model, name)
-    return grids[kind, order][model.signals(kind)[0].index(name if order else f"d{name}")]
-
-
-@frozen
-class Nodes:
-    """Instants t0 + part (t1 - t0) + offset of motions, each (N,), in order for the first one."""
-
-    part: np.ndarray
-    offset: np.ndarray
-
-    def at(self, t0, t1):
-        """The instants (N,) [s]."""
-        return t0 + self.part * (t1 - t0) + self.offset
-
-    def joined(self, t0, t1, times):
-        """These and further instants (N,), which are instants of the motion from t0 to t1."""
-        t = np.asarray(times)
-        inside = np.clip(t, t0, t1)
-        part, offset = np.append(self.part, (inside - t0) / (t1 - t0)), np.append(self.offset, t - inside)
-        order = np.argsort(t0 + part * (t1 - t0) + offset)
-        return Nodes(part[order], offset[order])
-
-
 @frozen
 class Evaluated:
     """Signals at nodes (s, N), their derivatives (s, N, k) there, mean squares (s,), and their derivatives (s, k)."""
@@ -403,122 +336,105 @@ class Search:
         self.motions, self.minimise, self.sizes, self.limits = motions, minimise, sizes, limits
         self.low, self.width = ranges[:, 0], ranges[:, 1] - ranges[:, 0]
         self.signals = tuple(dict.fromkeys([*sizes, *limits]))
-        self.panels, self.evaluated = SQUARE_PANELS, 0
-        count = FIRST_NODES + 1 if limits or minimise == "peak" else 2
-        t = np.linspace(motions.t0 - motions.ahead, motions.t1 + motions.after, count)
-        none = Nodes(np.zeros(0), np.zeros(0))
-        self.nodes = none.joined(motions.t0, motions.t1, t)
-        self.clear()
+        place = self.signals.index
+        self.peaks = [(place(name), sign, 0.0, size) for name, size in sizes.items() for sign in (1.0, -1.0)]
+        self.sides = [
+            (place(name), sign, side, size_of_limit(*ends) or 1.0)
+            for name, ends in limits.items()
+            for sign, side in zip((1.0, -1.0), ends, strict=True)
+            if np.isfinite(side)
+        ]
+        self.evaluated = 0
+        self.at_nodes(np.linspace(0.0, 1.0, FIRST_NODES + 1 if limits or minimise == "peak" else 2))
 
-    def clear(self):
-        """Forget motions that were evaluated at other nodes."""
-        self._known = functools.lru_cache(maxsize=64)(lambda data: self._local(np.frombuffer(data)))
+    def at_nodes(self, parts):
+        """Evaluate inequalities at these parts (N,) of the motion from now on."""
+        self.parts = np.sort(parts)
+        self.local = functools.lru_cache(maxsize=64)(lambda data: self._signals_of(np.frombuffer(data)))
 
     def parameters(self, v):
         """The parameters (k,) of unknowns (k,)."""
         return self.low + self.width * v
 
-    def local(self, v):
+    def at(self, v):
         """What is needed of the motion with unknowns v (k,)."""
-        return self._known(np.ascontiguousarray(v, dtype=float).tobytes())
+        return self.local(np.ascontiguousarray(v, dtype=float).tobytes())
 
-    def _local(self, v):
+    def _signals_of(self, v):
         self.evaluated += 1
-        try:
-            return self._signals_of(self.parameters(v))
-        except ServoError as error:
-            raise NoMotion(v, error) from error
-
-    def _signals_of(self, p):
-        model, (t1, end_slopes) = self.motions.with_parameters(p), self.motions.ends(p)
-        fixed = self.nodes.at(self.motions.t0, t1)
-        edges = [k for k in model.knots if fixed[0] < k < fixed[-1]]
-        t, weights = _quadrature([fixed[0], *edges, fixed[-1]], self.panels)
-        times, where = np.unique(np.concatenate([fixed, t]), return_inverse=True)
+        p = self.parameters(v)
+        model, (first, last, end_slopes) = self.motions.with_parameters(p), self.motions.window(p)
+        nodes = first + self.parts * (last - first)
+        t, weights = quadrature([first, *(k for k in model.knots if first < k < last), last], SQUARE_PANELS)
+        times, where = np.unique(np.concatenate([nodes, t]), return_inverse=True)
         run = self.motions.run(model, times)
         tangents = sensitivity(run, self.signals, self.motions.names)
         y = np.array([run[name] for name in self.signals])
         dy = np.array([[tangents[name, to] for to in self.motions.names] for name in self.signals]).swapaxes(1, 2)
-        at, inside = where[: len(fixed)], where[len(fixed) :]
+        at, inside = where[: len(nodes)], where[len(nodes) :]
         slopes = dy[:, at]
         if end_slopes.any():
-            slopes = slopes + _derivatives_at(run, self.signals, at)[:, :, None] * self.nodes.part[:, None] * end_slopes
-        length = fixed[-1] - fixed[0]
-        squares = y[:, inside] ** 2 @ weights / length
+            moved = np.array([rates(run, name)[at] for name in self.signals])
+            slopes = slopes + moved[:, :, None] * self.parts[:, None] * end_slopes
+        squares = y[:, inside] ** 2 @ weights / (last - first)
         end = (y[:, at[-1], None] ** 2 - squares[:, None]) * end_slopes
-        square_slopes = (np.einsum("sn,n,snk->sk", 2 * y[:, inside], weights, dy[:, inside]) + end) / length
+        square_slopes = (np.einsum("sn,n,snk->sk", 2 * y[:, inside], weights, dy[:, inside]) + end) / (last - first)
         return Evaluated(y[:, at], slopes * self.width, squares, square_slopes * self.width)
-
-    def _by_name(self, p):
-        return dict(zip(self.motions.names, p.tolist(), strict=True))
 
     # the cost and the inequalities
 
-    def rms(self, local):
+    def duration(self, v):
+        """t1 - t0 [s], and its derivatives (k,)."""
+        t1, slopes = self.motions.ends(self.parameters(v))
+        return t1 - self.motions.t0, slopes * self.width
+
+    def mean_square(self, v):
         """The mean square of the signals that count, and its derivatives (k,)."""
-        n = len(self.sizes)
+        local, n = self.at(v), len(self.sizes)
         weights = np.array([*self.sizes.values()]) ** -2.0
         return weights @ local.squares[:n], weights @ local.square_slopes[:n]
 
-    def relative(self, local):
-        """The signals that count over their sizes (n, N) and derivatives (n, N, k)."""
-        sizes = np.array([*self.sizes.values()])
-        return local.values[: len(sizes)] / sizes[:, None], local.slopes[: len(sizes)] / sizes[:, None, None]
+    def inside(self, v, sides):
+        """How far signals at nodes are inside some sides, relative to their sizes, (c,), and derivatives (c, k)."""
+        local = self.at(v)
+        values = [sign * (local.values[i] - side) / size for i, sign, side, size in sides]
+        slopes = [sign * local.slopes[i] / size for i, sign, _, size in sides]
+        return np.concatenate([np.zeros(0), *values]), np.concatenate([np.zeros((0, len(v))), *slopes])
 
     def cost(self, v):
         """What is minimised, in its own units."""
         if self.minimise == "time":
-            return self.motions.ends(self.parameters(v))[0] - self.motions.t0
-        local = self.local(v)
-        return np.sqrt(self.rms(local)[0]) if self.minimise == "rms" else np.abs(self.relative(local)[0]).max()
-
-    def within(self, v):
-        """How far signals at nodes are inside their limits, relative to these, (c,), and derivatives (c, k)."""
-        local, values, slopes = self.local(v), [np.zeros(0)], [np.zeros((0, len(v)))]
-        for name, (low, high) in self.limits.items():
-            i, size = self.signals.index(name), _size_of_limit(low, high)
-            for sign, side in ((1.0, low), (-1.0, high)):
-                if np.isfinite(side):
-                    values.append(sign * (local.values[i] - side) / size - SAFELY_INSIDE)
-                    slopes.append(sign * local.slopes[i] / size)
-        return np.concatenate(values), np.concatenate(slopes)
+            return self.duration(v)[0]
+        return np.sqrt(self.mean_square(v)[0]) if self.minimise == "rms" else -self.inside(v, self.peaks)[0].min()
 
     # the search
 
     def found(self):
-        """The design; solved with more nodes and panels until nothing is exceeded between them."""
+        """The design; solved with more nodes until nothing is exceeded between them."""
         motions = self.motions
         v = (motions.numbers - self.low) / self.width
         before = self.measured(v, motions.run(motions.model))
         for _ in range(SEARCHES):
             v = self.feasible(self.solved(v, self.minimise))
             plan = motions.run(motions.with_parameters(self.parameters(v)))
-            times = self.exceeding(v, plan)
-            doubled = self.minimise == "rms" and self.refined(v)
-            if not times and not doubled:
+            parts = self.exceeding(v, plan)
+            if not parts:
                 less = self.gain(v)[1]
                 if less is None:
                     return self.designed(v, before, plan)
                 v = less
-            if times:
-                self.nodes = self.nodes.joined(motions.t0, motions.ends(self.parameters(v))[0], times)
-            self.clear()
-        if any(excess > 0 for excess, *_ in _beyond_limits(plan, self.limits)):
+            self.at_nodes(np.append(self.parts, parts))
+        if any(excess > 0 for excess, *_ in excesses(plan, self.limits)):
             raise self.beyond(plan)
         return self.designed(v, before, plan)
 
     def designed(self, v, before, plan):
         """The result for the unknowns of a minimum, with its plan."""
-        values = self._by_name(self.parameters(v))
+        values = dict(zip(self.motions.names, self.parameters(v).tolist(), strict=True))
         if not plan.model.flat and self.motions.method is None:
-            _require_no_growth(plan.model, plan)
+            require_no_growth(plan, *GROWS)
             plan = judged(plan)
-        limits = [
-            (name, side)
-            for name, ends in self.limits.items()
-            for (value, _), limit, side in zip(extremes(plan, name), ends, ("lower", "upper"), strict=True)
-            if np.isfinite(limit) and abs(value - limit) <= REACHED * _size_of_limit(*ends)
-        ]
+        limits = [(name, side) for excess, name, side, *_ in excesses(plan, self.limits) if abs(excess) <= REACHED]
         at_ends = [
             (name, "lower" if x < 0.5 else "upper")
             for name, x in zip(values, v, strict=True)
@@ -543,54 +459,32 @@ class Search:
         return max(abs(value) / size for name, size in self.sizes.items() for value, _ in extremes(plan, name))
 
     def exceeding(self, v, plan):
-        """Instants of extrema of the plan that exceed a limit, or the peak at nodes."""
+        """Extrema of the plan that exceed a limit, or the peak at nodes, in parts of the motion."""
         limits = [(name, *ends) for name, ends in self.limits.items()]
         if self.minimise == "peak":
             peak = self.cost(v) * (1.0 + SAFELY_INSIDE)
             limits += [(name, -peak * size, peak * size) for name, size in self.sizes.items()]
         times = [t for name, low, high in limits for t in _extrema_beyond(plan, name, low, high)]
-        known = self.nodes.at(self.motions.t0, self.motions.ends(self.parameters(v))[0])
-        close = SMALLEST_REGION * np.ptp(known)
-        return [t for t in times if np.abs(known - t).min() > close]
-
-    def refined(self, v):
-        """Whether mean squares change with twice as many panels, which are then taken."""
-        if self.panels >= MOST_PANELS:
-            return False
-        coarse = self.rms(self.local(v))[0]
-        self.panels *= 2
-        self.clear()
-        if abs(self.rms(self.local(v))[0] - coarse) > QUADRATURE * coarse:
-            return True
-        self.panels //= 2
-        return False
+        parts = [(t - plan.t[0]) / np.ptp(plan.t) for t in times]
+        return [part for part in parts if np.abs(self.parts - part).min() > APART]
 
     def feasible(self, v):
         """Unknowns within the limits: these, or those of the minimum that is found from the ones of least excess."""
-        if not self.limits or self.within(v)[0].min() >= -SAFELY_INSIDE:
+        if self.keeps(v):
             return v
         least = self.solved(v, "excess")
-        if self.within(least)[0].min() < -SAFELY_INSIDE:
+        if not self.keeps(least):
             raise self.beyond(self.motions.run(self.motions.with_parameters(self.parameters(least))))
         again = self.solved(least, self.minimise)
-        return again if self.within(again)[0].min() >= -SAFELY_INSIDE else least
+        return again if self.keeps(again) else least
+
+    def keeps(self, v):
+        """Whether signals at nodes are within their limits."""
+        return self.inside(v, self.sides)[0].min(initial=0.0) >= 0.0
 
     def solved(self, v, what):
-        """Unknowns (k,) of a minimum from v, in a region that shrinks where there is no motion."""
-        problem, region = NonlinearProgram(self, what, v), np.inf
-        for _ in range(REGIONS):
-            low, high = np.maximum(v - region, 0.0), np.minimum(v + region, 1.0)
-            v, failure = problem.minimum(v, low, high)
-            if failure is not None:
-                region = np.abs(failure.at - v).max() / 2
-                if region < SMALLEST_REGION:
-                    raise failure
-                continue
-            edge = SMALLEST_REGION * (high - low)
-            if np.all(((v > low + edge) | (low == 0.0)) & ((v < high - edge) | (high == 1.0))):
-                break
-            region *= 2
-        return v
+        """Unknowns (k,) of a minimum from v."""
+        return NonlinearProgram(self, what, v).minimum(v)
 
     def gain(self, v):
         """How much of the cost is left to save within the limits, and unknowns (k,) of less cost, None without any."""
@@ -600,15 +494,15 @@ class Search:
         problem, k = NonlinearProgram(self, self.minimise, v), len(v)
         x = problem.start(v)
         ends = np.pad(np.vstack([np.eye(k)[v <= ACTIVE], -np.eye(k)[v >= 1.0 - ACTIVE]]), ((0, 0), (0, len(x) - k)))
-        met = problem.inequalities(x) <= ACTIVE
+        met = problem.inequalities(x)[0] <= ACTIVE
 
         def slopes(x):
-            return problem.cost(x)[1], np.vstack([ends, problem.slopes(x)[met]])
+            return problem.cost(x)[1], np.vstack([ends, problem.inequalities(x)[1][met]])
 
         def allowed(v):
             try:
-                return self.cost(v) if self.within(v)[0].min(initial=0.0) >= -SAFELY_INSIDE else np.inf
-            except NoMotion:
+                return self.cost(v) if self.keeps(v) else np.inf
+            except ServoError:
                 return np.inf
 
         gradient, active = slopes(x)
@@ -617,7 +511,7 @@ class Search:
         try:
             bent = [g - gradient - (rows - active).T @ balance for g, rows in (slopes(x + ACTIVE * d) for d in along)]
             rises = max(self.cost(v + ACTIVE * d) for d in np.diag(np.where(v < 0.5, 1.0, -1.0))) - self.cost(v)
-        except NoMotion:
+        except ServoError:
             return float(first), None
         curvature, directions = np.linalg.eigh(np.reshape(bent, along.shape) @ along.T / ACTIVE)
         steps = np.outer(PROBED, (directions.T @ along)[:, :k]).reshape(-1, k)
@@ -628,7 +522,7 @@ class Search:
 
     def beyond(self, plan):
         """The error of a motion that exceeds a limit."""
-        excess, name, t = max(_beyond_limits(plan, self.limits))
+        excess, name, _, t, *_ = max(excesses(plan, self.limits))
         (least, _), (most, _) = extremes(plan, name)
         return LimitExceeded(
             f"With the least excess that was found {name} exceeds its limit by {100 * excess:.3g} % at t = {t:.4g} s.",
@@ -643,104 +537,70 @@ class Search:
 
 
 class NonlinearProgram:
-    """The cost and the inequalities of x = v, or of x = (v, z) with a bound z of all magnitudes or excesses.
+    """The cost and the inequalities of x = v, or of x = (v, z) where the bound z of what exceeds some sides is least.
 
-    `what` is "rms", "peak", "time", or "excess", the largest one over limits. Costs, but for an excess, are relative to
-    the one at v (k,), where the search begins.
+    `what` is "rms", "time", "peak", the excess of magnitudes over zero, or "excess", that over limits. Costs, but for
+    an excess, are relative to the one at v (k,), where the search begins.
     """
 
     def __init__(self, search, what, v):
         self.search, self.what, self.k = search, what, len(v)
-        self.bounded = what in ("peak", "excess")
         self.scale = 1.0 if what == "excess" else search.cost(v) or 1.0
-        limited = search.limits or self.bounded
-        self.constraints = ({"type": "ineq", "fun": self.inequalities, "jac": self.slopes},) if limited else ()
+        self.kept = [] if what == "excess" else search.sides
+        self.least = {"peak": search.peaks, "excess": search.sides}.get(what, [])
+        self._known = None
 
     def start(self, v):
         """The unknowns x of v."""
-        if self.what == "excess":
-            return np.append(v, max(0.0, -self.search.within(v)[0].min()))
-        return np.append(v, self.search.cost(v) / self.scale) if self.bounded else v
+        excess = -self.search.inside(v, self.least)[0] / self.scale
+        return np.append(v, excess.max()) if self.least else v
 
-    def bounds(self, low, high):
-        """Lower and upper bounds of x."""
-        z = [(-ACTIVE, None)] * (self.what == "excess") + [(0.0, None)] * (self.what == "peak")
-        return [*zip(low, high, strict=True), *z]
-
-    def minimum(self, v, low, high):
-        """The unknowns (k,) of a minimum between bounds, None; or the last ones on the way, and why it ended there."""
+    def minimum(self, v):
+        """The unknowns (k,) of a minimum from v."""
         from scipy.optimize import minimize
 
-        passed = [v]
+        inequalities = {"fun": lambda x: self._evaluated(x)[1], "jac": lambda x: self._evaluated(x)[2]}
+        x = minimize(
+            lambda x: self._evaluated(x)[0],
+            self.start(v),
+            jac=True,
+            method="SLSQP",
+            bounds=[(0.0, 1.0)] * self.k + [(-ACTIVE, None)] * bool(self.least),
+            constraints=inequalities | {"type": "ineq"},
+            options={"maxiter": QUADRATIC_PROGRAMS, "ftol": UNCHANGED},
+        ).x
+        return np.clip(x[: self.k], 0.0, 1.0)
+
+    def _evaluated(self, x):
+        """The cost with its derivatives, the inequalities, and their derivatives.
+
+        Without a motion the cost is infinite beside the last inequalities: the line search shortens its step.
+        """
         try:
-            x = minimize(
-                self.cost,
-                self.start(v),
-                jac=True,
-                method="SLSQP",
-                bounds=self.bounds(low, high),
-                constraints=self.constraints,
-                callback=lambda x: passed.append(np.array(x[: self.k])),
-                options={"maxiter": QUADRATIC_PROGRAMS, "ftol": UNCHANGED},
-            ).x
-        except NoMotion as failure:
-            return passed[-1], failure
-        return np.clip(x[: self.k], low, high), None
+            self._known = self.cost(x), *self.inequalities(x)
+        except ServoError:
+            if self._known is None:
+                raise
+            (_, slopes), *inequalities = self._known
+            return (np.inf, slopes), *inequalities
+        return self._known
 
     def cost(self, x):
         """The cost, relative to that at the start, and its derivatives."""
-        search, v = self.search, x[: self.k]
-        if self.bounded:
+        if self.least:
             return x[-1], np.eye(len(x))[-1]
-        if self.what == "time":
-            t1, slopes = search.motions.ends(search.parameters(v))
-            return (t1 - search.motions.t0) / self.scale, slopes * search.width / self.scale
-        value, slopes = search.rms(search.local(v))
-        return value / self.scale**2, slopes / self.scale**2
+        timed = self.what == "time"
+        value, slopes = self.search.duration(x) if timed else self.search.mean_square(x)
+        scale = self.scale if timed else self.scale**2
+        return value / scale, slopes / scale
 
     def inequalities(self, x):
-        """What is not negative, (c,)."""
-        return self._inequalities(x)[0]
-
-    def slopes(self, x):
-        """Its derivatives (c, len(x))."""
-        return self._inequalities(x)[1]
-
-    def _inequalities(self, x):
-        search, v = self.search, x[: self.k]
-        values, slopes = search.within(v)
-        if not self.bounded:
-            return values, slopes
-        slopes = np.pad(slopes, ((0, 0), (0, 1)))
-        if self.what == "excess":
-            slopes[:, -1] = 1.0
-            return values + x[-1], slopes
-        y, dy = (part / self.scale for part in search.relative(search.local(v)))
-        magnitudes = [np.column_stack([sign * dy.reshape(-1, self.k), np.ones(y.size)]) for sign in (-1.0, 1.0)]
-        return np.concatenate([values, x[-1] - y.ravel(), x[-1] + y.ravel()]), np.concatenate([slopes, *magnitudes])
-
-
-def _quadrature(edges, panels):
-    """Instants (N,) [s] and weights (N,) of a quadrature over pieces, with about a number of panels in all."""
-    counts = np.ceil(panels * np.diff(edges) / np.ptp(edges)).astype(int)
-    pieces = zip(edges[:-1], edges[1:], counts, strict=True)
-    ends = np.concatenate([*(np.linspace(a, b, n + 1)[:-1] for a, b, n in pieces), edges[-1:]])
-    (x, weights), half = EIGHT_NODES, np.diff(ends)[:, None] / 2
-    return (ends[:-1, None] + half * (1 + x)).ravel(), (half * weights).ravel()
-
-
-def _size_of_limit(low, high):
-    """The size of a limit: its larger finite side."""
-    return max(abs(side) for side in (low, high) if np.isfinite(side)) or 1.0
-
-
-def _beyond_limits(plan, limits):
-    """(excess relative to the limit, name, instant) of each signal at each side."""
-    for name, (low, high) in limits.items():
-        (least, t_least), (most, t_most) = extremes(plan, name)
-        size = _size_of_limit(low, high)
-        yield float((low - least) / size), name, float(t_least)
-        yield float((most - high) / size), name, float(t_most)
+        """What is not negative, (c,), and its derivatives (c, len(x))."""
+        v, bounds = x[: self.k], ((0, 0), (0, len(x) - self.k))
+        kept, kept_slopes = self.search.inside(v, self.kept)
+        least, least_slopes = (part / self.scale for part in self.search.inside(v, self.least))
+        slopes = [np.pad(kept_slopes, bounds), np.pad(least_slopes, bounds, constant_values=1.0)]
+        return np.concatenate([kept - SAFELY_INSIDE, least + x[-1]]), np.concatenate(slopes)
 
 
 def _extrema_beyond(plan, name, low, high):

@@ -22,7 +22,7 @@ from servoctl.values import frozen
 VALUES = 257  # of the parameter, spread over its range, at which roots are computed
 TOUCHES = 1e-9  # of its largest value: a coefficient whose smallest value is below has a root there
 NARROWEST = 24  # of a step of the values, towards a value at which roots come closest to the axis
-BISECTIONS = 60  # halvings of an interval of the parameter: all digits of a double
+NEWTON_STEPS = 60  # to a rest
 CURVE_STEP, CURVE_STEPS = 0.02, 500  # along the rests of a program, relative to the size of the state; on either side
 SHOWN_RANGES, SHOWN_VALUES = 6, 3  # in the printed form
 
@@ -356,11 +356,14 @@ def _refined(polynomial, grid):
 
 def _edge(polynomial, a, b, first, last):
     """The value between a and b at which the verdict changes."""
+    from scipy.optimize import bisect
+
     part = 0 if first[0] != last[0] else 1
-    for _ in range(BISECTIONS):
-        middle = (a + b) / 2
-        a, b = (middle, b) if polynomial.kind(middle)[part] == first[part] else (a, middle)
-    return (a + b) / 2
+
+    def changed(value):
+        return -1.0 if polynomial.kind(value)[part] == first[part] else 1.0
+
+    return bisect(changed, a, b, xtol=TINY, rtol=4 * np.finfo(float).eps)
 
 
 def _losses(model, t, q0):
@@ -390,25 +393,26 @@ def _losses(model, t, q0):
 
 def _first_loss(at, q0, side):
     """The first rest along a curve at which det L has another sign; None if there is none."""
+    from scipy.optimize import bisect
+
     x, before, sign = np.array(q0, dtype=float), None, np.linalg.slogdet(at(q0)[2])[0]
     for _ in range(CURVE_STEPS):
         tangent = np.linalg.svd(at(x)[1])[2][-1]
         before = tangent * (side if before is None else np.sign(tangent @ before or 1.0))
-        low, high = 0.0, CURVE_STEP * (1.0 + np.abs(x).max())
-        if np.linalg.slogdet(at(_onto(at, x + high * before))[2])[0] == sign:
-            x = _onto(at, x + high * before)
-            continue
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2
-            same = np.linalg.slogdet(at(_onto(at, x + middle * before))[2])[0] == sign
-            low, high = (middle, high) if same else (low, middle)
-        return _onto(at, x + high * before)
+        step = before * CURVE_STEP * (1.0 + np.abs(x).max())
+
+        def same(part, x=x, step=step):
+            return 1.0 if np.linalg.slogdet(at(_onto(at, x + part * step))[2])[0] == sign else -1.0
+
+        if same(1.0) < 0:
+            return _onto(at, x + bisect(same, 0.0, 1.0, xtol=TINY, rtol=4 * np.finfo(float).eps) * step)
+        x = _onto(at, x + step)
     return None
 
 
 def _onto(at, x):
     """The rest nearest to a point."""
-    for _ in range(BISECTIONS):
+    for _ in range(NEWTON_STEPS):
         rows, slopes, _ = at(x)
         change = np.linalg.lstsq(slopes, rows.ravel(), rcond=None)[0]
         x = x - change

@@ -20,16 +20,19 @@ from servoctl.checks import (
     as_span,
     by_name,
     interval,
+    numbers_by_name,
     positive_number,
     positives,
     require_kind,
 )
+from servoctl.control.extremes import excesses, size_of_limit
+from servoctl.control.nonlinear import words
 from servoctl.errors import (
     IntegrationStopped,
     LimitExceeded,
     SpecificationError,
 )
-from servoctl.inversion.transcription import LONGEST, Mesh, Transcription
+from servoctl.inversion.transcription import WATCHED, Mesh, Transcription
 from servoctl.inversion.transfer import EXCEEDED, GUESS, Transfer, state_sizes
 from servoctl.methods.bounded import subdivided
 from servoctl.methods.motion import breakpoints
@@ -55,13 +58,7 @@ DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes;
 PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
 ROUNDS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
 SAMPLES = 1000  # of the run, at least
-STATUS = {
-    "Infeasible_Problem_Detected": "finds no motion",
-    "Maximum_Iterations_Exceeded": "does not converge in 200 iterations",
-    "Maximum_WallTime_Exceeded": f"does not converge in {LONGEST:g} s",
-    "Restoration_Failed": "finds no way back to the equations of motion",
-}
-SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+OPEN = (-np.inf, np.inf)
 
 
 def relaxed(
@@ -133,44 +130,41 @@ def relaxed(
     relaxation = Relaxation(at_once(plant), program, as_span(t_span, forward=True), limits, bounds, start, end)
     several = None if isinstance(weight, Mapping) else as_list(weight)
     if several is None:
-        return relaxation.run(_weights(weight, program))
+        return relaxation.run(weights_of(weight, program))
     weights = positives("weight", several, "Write weight=[1e-6, 1e-8].")
     return relaxation.front(array_of("weight", weights, None).tolist())
 
 
-def _weights(weight, program):
+def weights_of(weight, program):
     """β of each residual, (k,); None for the default."""
     if weight is None:
         return None
     if not isinstance(weight, Mapping):
         return np.full(len(program.names), positive_number("weight", weight))
-    weight = by_name(weight, program.names, "residual", "The weights")
+    weight = numbers_by_name(weight, program.names, "residual", "weight", positive=True)
     for name in program.names:
         if name not in weight:
             raise SpecificationError(
                 f"The residual {name!r} has no weight.", "Each residual has one.", do=f"Add {name!r}.", name=name
             )
-    return np.array([positive_number(name, weight[name]) for name in program.names])
+    return np.array([weight[name] for name in program.names])
 
 
 def _all_limits(plant, limits):
-    """The limits of magnitude and of rate, {actuator: (low, high)} each: those of the plant and further ones."""
-    magnitudes = dict(plant.limits)
-    rates = {name: (-rate, rate) for name, rate in plant.rate_limits.items()}
-    names = {name: (magnitudes, name) for name in plant.inputs} | {f"d{name}": (rates, name) for name in plant.inputs}
+    """(low, high) of actuators and of their rates, by name: the limits of the plant and further ones."""
+    known = dict(plant.limits) | {f"d{name}": (-rate, rate) for name, rate in plant.rate_limits.items()}
+    names = [*plant.inputs, *(f"d{name}" for name in plant.inputs)]
     for name, value in by_name(limits, names, "actuator or rate", "The limits").items():
-        sides, actuator = names[name]
-        low, high = interval(name, value, "limit")
-        before = sides.get(actuator, (-np.inf, np.inf))
-        sides[actuator] = max(low, before[0]), min(high, before[1])
-        if not sides[actuator][0] < sides[actuator][1]:
+        (low, high), before = interval(name, value, "limit"), known.get(name, OPEN)
+        known[name] = max(low, before[0]), min(high, before[1])
+        if not known[name][0] < known[name][1]:
             raise SpecificationError(
                 f"The limit of {name!r} is ({low:g}, {high:g}), that of the plant ({before[0]:g}, {before[1]:g}).",
                 "Both hold.",
                 do="Choose limits within those of the plant.",
                 name=name,
             )
-    return magnitudes, rates
+    return known
 
 
 @frozen
@@ -191,8 +185,8 @@ class Relaxation(Transfer):
     def _first(self, mesh):
         """The guess on a mesh."""
         times, nodes = np.linspace(*self.span, GUESS), np.append(mesh.edges[0], mesh.nodes)
-        x, u = (np.array([np.interp(nodes, times, row) for row in part]) for part in (self.states, self.inputs))
-        return Plan(mesh, mesh, x, mesh.control_points(u[:, 1:], u[:, 0]))
+        x = np.array([np.interp(nodes, times, row) for row in self.states])
+        return Plan(mesh, mesh, x, np.array([np.interp(mesh.places_of_points, times, row) for row in self.inputs]))
 
     # solutions
 
@@ -217,8 +211,8 @@ class Relaxation(Transfer):
         """Largest and root mean square values of residuals and inputs, the effort, and how well it is solved."""
         t = np.linspace(*self.span, SAMPLES + 1)
         f = self.node.function("signals", self.node.residuals, self.node.effort).map(len(t))
-        v = np.vstack([plan.pieces.inputs(plan.points, t, rate) for rate in range(self.node.depth + 1)])
-        residuals, effort = (np.array(part) for part in f(t[None], plan.mesh.states(plan.x, t), v))
+        v = self._inputs_of(plan, t)
+        residuals, effort = (np.array(part) for part in f(t[None], plan.x @ plan.mesh.of_states(t), v))
         signals = dict(zip((*self.program.names, *self.plant.inputs), (*residuals, *v[: self.m]), strict=True))
         largest = {f"largest {name}": np.abs(values).max() for name, values in signals.items()}
         rms = {f"rms {name}": np.sqrt(np.mean(values**2)) for name, values in signals.items()}
@@ -281,39 +275,36 @@ class Relaxation(Transfer):
     def _solved(self, plan, weights, iterations=()):
         """The plan of the last of falling weights, each solved from the one before."""
         nlp = Transcription(self.node, plan.mesh, plan.pieces, self.sizes, self.opening, self.target[2])
-        bounds, w, multipliers, iterations = self._sides(nlp), nlp.joined(plan.x, plan.points), None, list(iterations)
+        sides, w, iterations = self._sides(plan), nlp.joined(plan.x, plan.points), list(iterations)
         for beta in weights:
-            w, multipliers, stats = nlp.solve(w, beta, bounds, None if self.bounds else multipliers)
+            w, stats = nlp.solve(w, beta, sides)
             iterations.append(stats["iter_count"])
-            if stats["return_status"] not in SOLVED:
-                raise self._failed(nlp, (w, beta, bounds), stats["return_status"], plan)
-        return Plan(plan.mesh, plan.pieces, *nlp.apart(w), tuple(iterations))
+            if words(stats):
+                raise self._failed(nlp, plan, beta, stats)
+        return replace(plan, **dict(zip(("x", "points"), nlp.apart(w), strict=True)), iterations=tuple(iterations))
 
-    def _sides(self, nlp):
-        """Bounds of the variables and of the constraints by kind."""
-        K, P = 1 + nlp.count, 1 + len(nlp.pieces.nodes)
-        x = np.repeat([[-np.inf], [np.inf]], self.n * K, axis=1).reshape(2, self.n, K)
+    def _sides(self, plan):
+        """Sides of the states, of the control points, and of the constraints that have some, by kind."""
+        inputs, (_, u_size, size, _) = self.plant.inputs, self.sizes
+        x, count = _sides([OPEN] * self.n, plan.x.shape[1]), plan.points.shape[1]
         if self.opening is None:
             x[:, :, 0] = self.begin
         fixed = np.isfinite(self.target[0])
         x[:, fixed, -1] = self.target[0][fixed]
-        u = np.repeat([[-np.inf], [np.inf]], self.m * P, axis=1).reshape(2, self.m, P)
-        slopes = np.repeat([[-np.inf], [np.inf]], self.m * (P - 1), axis=1).reshape(2, self.m, P - 1)
-        jump = np.zeros((2, self.m, 1))
-        for i, name in enumerate(self.plant.inputs):
-            if name in self.limits:
-                u[:, i] = np.array(self.limits[name])[:, None]
-            if name in self.rates:
-                slopes[:, i] = np.array(self.rates[name])[:, None] / self.sizes[1][i]
-                jump[:, i] = [[-np.inf], [np.inf]]
-                u[:, i, 0] = self.begin_inputs[i] if self.held is not None else u[:, i, 0]
-                u[:, i, -1] = self.target[1][i] if self.target[1] is not None and not self.target[2] else u[:, i, -1]
-        bounded = np.array([*self.bounds.values()]).reshape(-1, 2).T[:, :, None] / self.sizes[2][:, None]
-        bounded = bounded.repeat(len(nlp.watched), axis=2)
-        start, rest = (np.zeros((2, f.numel_out(0) if f else 0, 1)) for f in (self.opening, self.target[2]))
-        motion = np.zeros((2, self.n, K - 1))
-        limits = {"motion": motion, "begin": jump, "slope": slopes, "bound": bounded, "start": start, "rest": rest}
-        return nlp.joined(x[0], u[0]), nlp.joined(x[1], u[1]), limits
+        u = _sides([self.limits.get(name, OPEN) for name in inputs], count)
+        rates = [f"d{name}" for name in inputs]
+        limited = np.array([rate in self.limits for rate in rates])  # which do not jump
+        if self.held is not None:
+            u[:, limited, 0] = self.held[limited]
+        if self.target[1] is not None and not self.target[2]:
+            u[:, limited, -1] = self.target[1][limited]
+        return {
+            "x": x,
+            "u": u,
+            "begin": _sides(np.where(limited[:, None], OPEN, 0.0), 1),
+            "slope": _sides([self.limits.get(name, OPEN) for name in rates], count - 1) / u_size[:, None],
+            "bound": _sides(self.bounds.values(), WATCHED * len(plan.pieces.h)) / size[:, None],
+        }
 
     def _useless(self, beta, usual):
         i = int(np.argmax(beta / usual))
@@ -328,80 +319,46 @@ class Relaxation(Transfer):
             most=float(usual[i]),
         )
 
-    def _failed(self, nlp, solution, status, plan):
+    def _failed(self, nlp, plan, beta, stats):
         """The error of an iteration that ends without a solution: what would be exceeded without limits, and where."""
-        w, beta, bounds = solution
-        said = STATUS.get(status, status)
-        row, t, value, side = self._violation(nlp, w, bounds)
-        facts = {"status": status, "weights": beta.tolist()}
+        facts = {"status": stats["return_status"], "weights": beta.tolist()}
+        limits = self.limits | self.bounds
         free = copy(self)
-        free.limits, free.rates, free.bounds = {}, {}, dict.fromkeys(self.bounds, (-np.inf, np.inf))
-        limited = self.limits or self.rates or self.bounds
-        without = nlp.solve(nlp.joined(plan.x, plan.points), beta, free._sides(nlp)) if limited else None
-        if without is None or without[2]["return_status"] not in SOLVED:
+        free.limits, free.bounds = {}, dict.fromkeys(self.bounds, OPEN)
+        w, without = nlp.solve(nlp.joined(plan.x, plan.points), beta, free._sides(plan)) if limits else (None, stats)
+        if words(without):
             return IntegrationStopped(
-                f"IPOPT {said}; the largest violation is that of {row} at t = {t:.4g} s, {abs(value - side):.3g}.",
+                f"IPOPT {words(stats)}.",
                 "A plan satisfies the equations of motion and the conditions at both ends.",
                 do="Choose a greater weight, a longer span, or a start and an end nearer to the program.",
-                row=row,
-                t=t,
-                violation=float(abs(value - side)),
                 **facts,
             )
-        row, t, value, side = self._violation(nlp, without[0], bounds)
-        kind = LimitExceeded if status == "Infeasible_Problem_Detected" else IntegrationStopped
+        run = free._as_run(Plan(plan.mesh, plan.pieces, *nlp.apart(w)))
+        _, name, _, t, value, limit = max(excesses(run, limits))
+        kind = LimitExceeded if facts["status"] == "Infeasible_Problem_Detected" else IntegrationStopped
         return kind(
-            f"IPOPT {said} within the limits and bounds; without them {row} is {value:.5g} at t = {t:.4g} s, "
-            f"beyond {side:.5g}.",
+            f"IPOPT {words(stats)} within the limits and bounds; without them {name} is {value:.5g} at t = {t:.4g} s, "
+            f"beyond {limit:.5g}.",
             "A plan keeps all limits from end to end.",
             do="Widen this limit, choose a greater weight, or give the transition more time.",
-            row=row,
+            row=name,
             t=t,
-            value=value,
-            limit=side,
+            value=float(value),
+            limit=float(limit),
             **facts,
         )
 
-    def _violation(self, nlp, w, bounds):
-        """Name, instant [s], value and side of what violates its bounds most, relative to its size, in SI."""
-        found = []
-        for names, at, size, *sides in self._checked(nlp, w, bounds):
-            value, low, high = (part * size[:, None] for part in sides)
-            scale = np.maximum(size, np.abs(np.where(np.isfinite(value), value, 0.0)).max(axis=1, initial=0.0))
-            excess = np.maximum(low - value, value - high) / scale[:, None]
-            if excess.size:
-                i, k = np.unravel_index(np.argmax(excess), excess.shape)
-                side = low[i, k] if value[i, k] < low[i, k] else high[i, k]
-                found.append((excess[i, k], (names[i], float(at[k]), float(value[i, k]), float(side))))
-        return max(found, key=lambda entry: entry[0])[1]
-
-    def _checked(self, nlp, w, bounds):
-        """What has bounds: names, instants, sizes, and in these the values and the lower and upper sides."""
-        mesh, pieces, (x_size, u_size) = nlp.mesh, nlp.pieces, self.sizes[:2]
-        states, inputs = self.plant.state_names, self.plant.inputs
-        of_variables = zip(*(nlp.apart(part) for part in (w, *bounds[:2])), strict=True)
-        for names, each, parts in zip((states, inputs), (mesh, pieces), of_variables, strict=True):
-            yield names, np.append(each.edges[0], each.nodes), np.ones(len(names)), *parts
-        rows = {
-            "motion": ([f"the motion of {name}" for name in states], mesh.nodes, x_size),
-            "begin": (inputs, mesh.edges[:1], u_size),
-            "slope": ([f"d{name}" for name in inputs], pieces.nodes, u_size),
-            "bound": (self.node.bounds, nlp.watched, self.sizes[2]),
-        }
-        values, limits = nlp.constraints(w), bounds[2]
-        for kind, where, at in (("start", "start", mesh.edges[:1]), ("rest", "end", mesh.edges[-1:])):
-            count = len(values[kind])
-            rows[kind] = ([f"the condition at the {where}"] * count, at, np.ones(count))
-        for kind, (names, at, size) in rows.items():
-            yield names, at, size, values[kind], *limits[kind]
+    def _inputs_of(self, plan, t):
+        """(u, u', ...) at instants (M,), as the node takes them."""
+        return np.vstack([plan.points @ plan.pieces.of_inputs(t, rate) for rate in range(self.node.depth + 1)])
 
     def _defects(self, plan):
         """Largest defect h (x' - f) between the nodes of each interval, relative to the sizes of the states, (N,)."""
-        mesh, (x, u), theta = plan.mesh, (plan.x, plan.points), np.array(PLACES)
+        mesh, x, theta = plan.mesh, plan.x, np.array(PLACES)
         t = (mesh.edges[:-1, None] + mesh.h[:, None] * theta).ravel()
         f = self.node.function("rates", self.node.rates).map(len(t))
-        v = np.vstack([plan.pieces.inputs(u, t, rate) for rate in range(self.node.depth + 1)])
-        defect = mesh.states(x, t, 1) - np.array(f(t[None], mesh.states(x, t), v))
+        v = self._inputs_of(plan, t)
+        defect = x @ mesh.of_states(t, 1) - np.array(f(t[None], x @ mesh.of_states(t), v))
         defect *= np.repeat(mesh.h, len(theta)) / state_sizes(x, self.nq, self.span)[:, None]
         return np.abs(defect).max(axis=0).reshape(len(mesh.h), -1).max(axis=1)
 
@@ -414,7 +371,7 @@ class Relaxation(Transfer):
             return None
         finer = Mesh(subdivided(mesh.edges, pieces), mesh.order)
         nodes = np.append(mesh.edges[0], finer.nodes)
-        return replace(plan, mesh=finer, x=mesh.states(plan.x, nodes))
+        return replace(plan, mesh=finer, x=plan.x @ mesh.of_states(nodes))
 
     def _as_run(self, plan):
         """The run of the plant under the plan's inputs."""
@@ -424,8 +381,8 @@ class Relaxation(Transfer):
         model = driven(self.plant, inputs, self.program.residuals)
         parts = max(1, -(-SAMPLES // len(mesh.h)))
         t = subdivided(mesh.edges, np.full(len(mesh.h), parts))
-        x = mesh.states(plan.x, t)
-        v = np.vstack([plan.pieces.inputs(plan.points, t, rate) for rate in range(self.node.depth + 1)])
+        x = plan.x @ mesh.of_states(t)
+        v = self._inputs_of(plan, t)
         jets = np.vstack([x, np.array(self.node.function("motion", self.node.acceleration).map(len(t))(t[None], x, v))])
         if not np.isfinite(model.function("ode").grid(t, x, model.parameters)).all():
             model = model.near(t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
@@ -449,6 +406,11 @@ class Relaxation(Transfer):
         text = ""
         for name, (low, high) in self.bounds.items():
             excess = float(np.max(np.maximum(low - run[name], run[name] - high)))
-            if excess > EXCEEDED * max(abs(side) for side in (low, high) if np.isfinite(side)):
+            if excess > EXCEEDED * size_of_limit(low, high):
                 text += f"; between its instants {name} exceeds its bound by {excess:.2g}"
         return text
+
+
+def _sides(sides, count):
+    """Sides (rows of (low, high)) at each of so many instants, (2, rows, instants)."""
+    return np.array([*sides], dtype=float).reshape(-1, 2).T[:, :, None].repeat(count, axis=2)

@@ -6,6 +6,7 @@ from dataclasses import field
 import numpy as np
 
 from servoctl.checks import by_name, interval
+from servoctl.control.extremes import extremes, rates, sampled_extremes
 from servoctl.errors import NotRealisable, SpecificationError
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
@@ -19,8 +20,6 @@ from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.units import rate_unit
 from servoctl.values import frozen
-
-FEWEST_OF_A_SPLINE = 4  # samples between two knots through which a spline of order 3 is laid
 
 
 @frozen
@@ -358,34 +357,14 @@ def _effort(run, name, limits):
     """An `Effort` from a signal of a run."""
     (low, t_low), (high, t_high) = extremes(run, name)
     peak, peak_at = max(((low, t_low), (high, t_high)), key=lambda extreme: abs(extreme[0]))
-    rates = _derivative(run, name)
-    rate, rate_at = max(_sampled_extremes(run.t, rates), key=lambda extreme: abs(extreme[0]))
+    changes = rates(run, name)
+    rate, rate_at = max(sampled_extremes(run.t, changes), key=lambda extreme: abs(extreme[0]))
     nearest = {}
     if limits is not None:
         room, limit_at, limit = min((low - limits[0], t_low, limits[0]), (limits[1] - high, t_high, limits[1]))
         nearest = {"limit": limit, "limit_at": limit_at, "room": room}
     mean, unit = _rms(run.t, run[name]), run.unit(name)
-    return Effort(peak, peak_at, mean, rate, rate_at, _rms(run.t, rates), **nearest, unit=unit)
-
-
-def extremes(run, name):
-    """(value, instant [s]) of the least and the greatest value of a signal, or of the rate of one, along a run.
-
-    Parameters
-    ----------
-    run : Run
-    name : str
-        A signal, or d and the name of one.
-    """
-    if name not in run and name[:1] == "d" and name[1:] in run:
-        return _sampled_extremes(run.t, _derivative(run, name[1:]))
-    return tuple((value, t) for t, value in run.extrema(name))
-
-
-def _sampled_extremes(t, values):
-    if not np.isfinite(values).any():
-        return (np.nan, float(t[0])), (np.nan, float(t[0]))
-    return tuple((float(values[k]), float(t[k])) for k in (int(np.nanargmin(values)), int(np.nanargmax(values))))
+    return Effort(peak, peak_at, mean, rate, rate_at, _rms(run.t, changes), **nearest, unit=unit)
 
 
 def _rms(t, values):
@@ -393,22 +372,3 @@ def _rms(t, values):
     known = np.isfinite(values)
     t, squares = t[known], values[known] ** 2
     return float(np.sqrt(np.diff(t) @ (squares[1:] + squares[:-1]) / 2 / (t[-1] - t[0]))) if len(t) > 1 else np.nan
-
-
-def _derivative(run, name):
-    """The derivative of a signal at the samples: exact if the run has the jets, else of splines between knots."""
-    from scipy.interpolate import CubicSpline
-
-    try:
-        return run[f"d{name}"]
-    except SpecificationError:
-        values, rates = run[name], np.full(len(run.t), np.nan)
-    edges = [-np.inf, *sorted(run.knots), np.inf]
-    direction = 1 if run.t[-1] >= run.t[0] else -1
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        inside = np.flatnonzero((run.t >= a) & (run.t <= b) & np.isfinite(values))[::direction]
-        if len(inside) >= FEWEST_OF_A_SPLINE:
-            slopes = CubicSpline(run.t[inside], values[inside])(run.t[inside], 1)
-            larger = ~(np.abs(rates[inside]) >= np.abs(slopes))  # at a knot the rate may jump
-            rates[inside[larger]] = slopes[larger]
-    return rates

@@ -11,37 +11,12 @@ from math import comb
 import casadi as ca
 import numpy as np
 
+from servoctl.control.nonlinear import solver
 from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
 from servoctl.values import frozen
 
 WATCHED = 12  # instants of bounds in an interval of the inputs
-PIVOTS = 0.1  # threshold of MUMPS: with smaller ones rounding hides the inertia of stiff machines
-LONGEST = 120.0  # of a solution [s]
-IPOPT = {
-    "print_level": 0,
-    "sb": "yes",
-    "tol": 1e-8,
-    "acceptable_tol": 1e-6,  # rounding of φ²/β for small β
-    "acceptable_iter": 2,
-    "acceptable_constr_viol_tol": 1e-9,
-    "max_iter": 200,
-    "bound_relax_factor": 0.0,
-    "nlp_scaling_method": "none",
-    "mu_strategy": "adaptive",
-    "mumps_pivtol": PIVOTS,
-    "max_wall_time": LONGEST,
-}
-WARM = {
-    "warm_start_init_point": "yes",
-    "warm_start_bound_push": 1e-9,
-    "warm_start_mult_bound_push": 1e-9,
-    "warm_start_slack_bound_push": 1e-9,
-    "warm_start_bound_frac": 1e-9,
-    "warm_start_slack_bound_frac": 1e-9,
-    "mu_init": 1e-6,
-    "mu_strategy": "monotone",
-}
 
 
 class Node:
@@ -111,39 +86,38 @@ class Mesh:
     @property
     def weights(self):
         """Weights of the nodes in integrals over time, (N s,) array [s]."""
-        s = len(self.c)
-        at_nodes = np.linalg.solve(np.vander(self.c, s, increasing=True).T, 1.0 / np.arange(1, s + 1))
-        return (self.h[:, None] * at_nodes).ravel()
+        return (self.h[:, None] * np.linalg.inv(radau(self.order)[1])[-1]).ravel()
 
     def place(self, t):
         """The interval of each instant (M,), and its place in it from 0 to 1."""
         k = np.clip(np.searchsorted(self.edges, t, side="right") - 1, 0, len(self.h) - 1)
         return k, (t - self.edges[k]) / self.h[k]
 
-    def states(self, x, t, rate=0):
-        """States (n_x, M) at instants from those at the start and the nodes (n_x, 1 + N s), or their rates."""
+    def of_states(self, t, rate=0):
+        """The matrix (1 + N s, M) from states at the start and all nodes to states or rates at instants (M,)."""
         k, theta = self.place(t)
-        s = len(self.c)
-        weights = (basis_rates if rate else basis)(self.c, theta) / self.h[k] ** rate
-        begin = x[:, k * s]
-        stages = x[:, 1:].reshape(len(x), -1, s)[:, k]
-        return begin * (rate == 0) + np.einsum("xns,sn->xn", stages - begin[:, :, None], weights)
+        stages = (basis_rates if rate else basis)(self.c, theta).T
+        begin = (rate == 0) - stages.sum(axis=1, keepdims=True)
+        return self._of_intervals(k, np.hstack([begin, stages]) / self.h[k, None] ** rate)
 
-    def inputs(self, points, t, rate=0):
-        """Inputs (m, M) at instants from their control points (m, 1 + N s), or their derivatives."""
+    def of_inputs(self, t, rate=0):
+        """The matrix (1 + N s, M) from control points to inputs at instants (M,), or to their derivatives."""
         k, theta = self.place(t)
-        s = len(self.c)
-        values = points[:, k[:, None] * s + np.arange(s + 1)]
-        return np.einsum("uns,ns->un", values, bernstein(s, theta, rate) / self.h[k, None] ** rate)
+        return self._of_intervals(k, bernstein(len(self.c), theta, rate) / self.h[k, None] ** rate)
 
-    def control_points(self, values, begin):
-        """Control points (m, 1 + N s) of inputs with these values (m, N s) at the nodes and (m,) at the start."""
-        s, matrix = len(self.c), np.linalg.inv(bernstein(len(self.c), np.append(0.0, self.c)))
-        points = [np.asarray(begin, dtype=float)[:, None]]
-        for i in range(len(self.h)):
-            known = np.hstack([points[-1][:, -1:], values[:, i * s : (i + 1) * s]])
-            points.append((known @ matrix.T)[:, 1:])
-        return np.hstack(points)
+    def _of_intervals(self, k, values):
+        """The sparse matrix of values (M, s + 1) at the begin and the nodes of intervals (M,)."""
+        from scipy.sparse import csc_matrix
+
+        s = len(self.c)
+        rows, columns = k[:, None] * s + np.arange(s + 1), np.repeat(np.arange(len(k)), s + 1)
+        return csc_matrix((values.ravel(), (rows.ravel(), columns)), shape=(1 + len(self.nodes), len(k)))
+
+    @property
+    def places_of_points(self):
+        """Instants [s] at which control points are nearly values, (1 + N s,) array."""
+        s = len(self.c)
+        return np.append((self.edges[:-1, None] + self.h[:, None] * np.arange(s) / s).ravel(), self.edges[-1])
 
     def power_coefficients(self, points):
         """Coefficients (s + 1, N, m) of the inputs' polynomials in a place from -1 to 1 on each interval."""
@@ -176,7 +150,9 @@ class Transcription:
 
     def __init__(self, node, mesh, pieces, sizes, start=None, rest=None):
         self.node, self.mesh, self.pieces, self.sizes, self.start, self.rest = node, mesh, pieces, sizes, start, rest
-        self.n, self.m, self.count = len(sizes[0]), len(sizes[1]), len(mesh.nodes)
+        w, beta, objective, self._constraints = self._problem()
+        g = ca.vertcat(*(ca.vec(value) for value in self._constraints.values()))
+        self._solver = solver({"x": w, "p": beta, "f": objective, "g": g})
 
     @cached_property
     def watched(self):
@@ -184,33 +160,29 @@ class Transcription:
         inside = np.arange(1, WATCHED + 1) / WATCHED
         return (self.pieces.edges[:-1, None] + self.pieces.h[:, None] * inside).ravel()
 
-    @cached_property
     def _problem(self):
         """Variables, weights, the objective, and the constraints by kind."""
-        from scipy.sparse import block_diag, coo_matrix
-
-        node, mesh, K, s = self.node, self.mesh, self.count, len(self.mesh.c)
-        count = self.n * (1 + K) + self.m * (1 + len(self.pieces.nodes))
-        w, beta = ca.MX.sym("w", count), ca.MX.sym("beta", node.residuals.numel())
-        x, points = self._split(w)
+        node, mesh, pieces, K, s = self.node, self.mesh, self.pieces, len(self.mesh.nodes), len(self.mesh.c)
+        x, points = ca.MX.sym("x", len(self.sizes[0]), 1 + K), ca.MX.sym("u", len(self.sizes[1]), 1 + len(pieces.nodes))
+        w, beta = ca.veccat(x, points), ca.MX.sym("beta", node.residuals.numel())
+        x, points = ca.diag(ca.DM(self.sizes[0])) @ x, ca.diag(ca.DM(self.sizes[1])) @ points
         f = node.function("node", node.rates, node.residuals, node.effort).map(K)
-        v = ca.vertcat(*(points @ _matrix(_at(self.pieces, mesh.nodes, k)) for k in range(node.depth + 1)))
+        v = ca.vertcat(*(points @ ca.DM(pieces.of_inputs(mesh.nodes, k)) for k in range(node.depth + 1)))
         rates, residuals, effort = f(ca.DM(mesh.nodes).T, x[:, 1:], v)
         begins = np.repeat(np.arange(0, K, s), s).tolist()
-        increments = (x[:, 1:] - x[:, begins]) @ _matrix(block_diag([coo_matrix(radau(mesh.order)[1].T)] * len(mesh.h)))
-        h = ca.repmat(ca.DM(np.repeat(mesh.h, s)).T, self.n, 1)
+        increments = (x[:, 1:] - x[:, begins]) @ ca.diagcat(*[ca.DM(radau(mesh.order)[1].T)] * len(mesh.h))
         cost = ca.sum1(residuals**2 / ca.repmat(beta, 1, K)) + effort
-        scale = self.sizes[3] * np.sum(mesh.h)
         highest = ca.DM([(-1.0) ** (s - j) * comb(s, j) for j in range(s + 1)])
+        slopes = (points[:, 1:] - points[:, :-1]) @ ca.diag(ca.DM(s / np.repeat(pieces.h, s)))
         constraints = {
-            "motion": (increments - h * rates) / ca.repmat(ca.DM(self.sizes[0]), 1, K),
+            "motion": (increments - rates @ ca.diag(ca.DM(np.repeat(mesh.h, s)))) / _each(self.sizes[0], K),
             "begin": points[:, : s + 1] @ highest / ca.DM(self.sizes[1]),
-            "slope": points @ _matrix(_slopes(self.pieces)) / ca.DM(self.sizes[1]),
+            "slope": slopes / _each(self.sizes[1], len(pieces.nodes)),
             "bound": self._bounded(x, points),
             "start": self.start(mesh.edges[0], x[:, 0]) if self.start else ca.MX(0, 1),
             "rest": self.rest(mesh.edges[-1], x[:, -1], v[:, -1]) if self.rest else ca.MX(0, 1),
         }
-        return w, beta, ca.dot(cost, ca.DM(mesh.weights).T) / scale, constraints
+        return w, beta, ca.dot(cost, ca.DM(mesh.weights).T) / (self.sizes[3] * np.sum(mesh.h)), constraints
 
     def _bounded(self, x, points):
         """Bounded quantities (b, P w) at instants that do not change with the mesh of the states."""
@@ -218,14 +190,8 @@ class Transcription:
         if not node.bounds:
             return ca.MX(0, len(t))
         f = node.function("bounded", node.bounded).map(len(t))
-        v = ca.vertcat(*(points @ _matrix(_at(self.pieces, t, k)) for k in range(node.depth + 1)))
-        return f(ca.DM(t).T, x @ _matrix(_states_at(self.mesh, t)), v) / ca.repmat(ca.DM(self.sizes[2]), 1, len(t))
-
-    def _split(self, w):
-        """States and control points, in SI, of the variables."""
-        x, points = ca.vertsplit(w, [0, self.n * (1 + self.count), w.numel()])
-        x, points = ca.reshape(x, self.n, -1), ca.reshape(points, self.m, -1)
-        return ca.diag(ca.DM(self.sizes[0])) @ x, ca.diag(ca.DM(self.sizes[1])) @ points
+        v = ca.vertcat(*(points @ ca.DM(self.pieces.of_inputs(t, k)) for k in range(node.depth + 1)))
+        return f(ca.DM(t).T, x @ ca.DM(self.mesh.of_states(t)), v) / _each(self.sizes[2], len(t))
 
     def joined(self, x, points):
         """The variables (n_w,) of states (n_x, 1 + N s) and control points (m, 1 + P s)."""
@@ -234,78 +200,23 @@ class Transcription:
 
     def apart(self, w):
         """What `joined` joins."""
-        x, points = np.split(w, [self.n * (1 + self.count)])
-        x, points = x.reshape(self.n, -1, order="F"), points.reshape(self.m, -1, order="F")
-        return x * self.sizes[0][:, None], points * self.sizes[1][:, None]
+        x, points = np.split(w, [len(self.sizes[0]) * (1 + len(self.mesh.nodes))])
+        of_states, of_inputs = (size[:, None] for size in self.sizes[:2])
+        x, points = x.reshape(len(of_states), -1, order="F"), points.reshape(len(of_inputs), -1, order="F")
+        return x * of_states, points * of_inputs
 
-    def constraints(self, w):
-        """Values of the constraints by kind, as arrays (rows, instants)."""
-        w_, _, _, constraints = self._problem
-        values = ca.Function("constraints", [w_], list(constraints.values()))(w)
-        return {kind: np.array(value) for kind, value in zip(constraints, values, strict=True)}
+    def solve(self, w, beta, sides):
+        """Variables w (n_w,) of the solution that is found from an approximation w, and IPOPT's statistics.
 
-    @cached_property
-    def _solvers(self):
-        return {}
-
-    def solve(self, w, beta, bounds, multipliers=None):
-        """Variables w (n_w,), multipliers and statistics of the solution that is found from an approximation w.
-
-        `beta` (k,) divides the squares of the residuals. `bounds` is (lower, upper, {kind: (lower, upper)}) of the
-        variables (n_w,) and of the constraints, as arrays (rows, instants). Multipliers are pairs, of bounds and of
-        constraints; those passed are of a nearby solution, where this one begins.
+        `beta` (k,) divides the squares of the residuals. `sides` are lower and upper ones (2, rows, instants) of the
+        states "x", of the control points "u", and of constraints by kind; others vanish.
         """
-        warm = multipliers is not None
-        lower, upper, limits = bounds
-        solver = self._solver(warm)
-        sides = [np.concatenate([limits[kind][i].ravel(order="F") for kind in limits]) for i in (0, 1)]
-        start = {"lam_x0": multipliers[0], "lam_g0": multipliers[1]} if warm else {}
-        result = solver(x0=w, p=beta, lbx=lower, ubx=upper, lbg=sides[0], ubg=sides[1], **start)
-        found = {name: np.array(value).ravel() for name, value in result.items()}
-        return found["x"], (found["lam_x"], found["lam_g"]), solver.stats()
-
-    def _solver(self, warm):
-        if warm not in self._solvers:
-            w, beta, objective, constraints = self._problem
-            g = ca.vertcat(*(ca.vec(value) for value in constraints.values()))
-            quiet = {"print_time": False, "show_eval_warnings": False, "calc_lam_p": False}
-            options = quiet | {"ipopt": IPOPT | (WARM if warm else {})}
-            self._solvers[warm] = ca.nlpsol("relaxed", "ipopt", {"x": w, "p": beta, "f": objective, "g": g}, options)
-        return self._solvers[warm]
+        lower, upper = (self.joined(sides["x"][i], sides["u"][i]) for i in (0, 1))
+        kinds = [sides.get(kind, np.zeros((2, *value.shape))) for kind, value in self._constraints.items()]
+        lower_g, upper_g = (np.concatenate([side[i].ravel(order="F") for side in kinds]) for i in (0, 1))
+        found = self._solver(x0=w, p=beta, lbx=lower, ubx=upper, lbg=lower_g, ubg=upper_g)
+        return np.array(found["x"]).ravel(), self._solver.stats()
 
 
-def _at(pieces, t, rate):
-    """The matrix (1 + P s, M) from control points to derivatives of the inputs at instants (M,)."""
-    from scipy.sparse import csc_matrix
-
-    k, theta = pieces.place(t)
-    s = len(pieces.c)
-    values = bernstein(s, theta, rate) / pieces.h[k, None] ** rate
-    rows, columns = k[:, None] * s + np.arange(s + 1), np.repeat(np.arange(len(t)), s + 1)
-    return csc_matrix((values.ravel(), (rows.ravel(), columns)), shape=(1 + len(pieces.nodes), len(t)))
-
-
-def _states_at(mesh, t):
-    """The matrix (1 + N s, M) from states at the start and all nodes to those at instants (M,)."""
-    from scipy.sparse import csc_matrix
-
-    k, theta = mesh.place(t)
-    s = len(mesh.c)
-    of_stages = basis(mesh.c, theta).T
-    values = np.hstack([1.0 - of_stages.sum(axis=1, keepdims=True), of_stages])
-    rows, columns = k[:, None] * s + np.arange(s + 1), np.repeat(np.arange(len(t)), s + 1)
-    return csc_matrix((values.ravel(), (rows.ravel(), columns)), shape=(1 + len(mesh.nodes), len(t)))
-
-
-def _slopes(pieces):
-    """The matrix (1 + P s, P s) from control points to those of the derivative."""
-    from scipy.sparse import diags
-
-    s, count = len(pieces.c), len(pieces.nodes)
-    slopes = s / np.repeat(pieces.h, s)
-    return diags([-slopes, slopes], [0, -1], shape=(1 + count, count))
-
-
-def _matrix(sparse):
-    """A constant sparse matrix of CasADi."""
-    return ca.DM(sparse.tocsc())
+def _each(sizes, count):
+    return ca.repmat(ca.DM(sizes), 1, count)

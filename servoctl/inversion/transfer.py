@@ -6,7 +6,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import finite, interval, mapping, named, numbers_by_name, rows_read
+from servoctl.checks import interval, mapping, numbers_by_name, rows_read
 from servoctl.errors import InconsistentStart, LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.inversion.transcription import Node
 from servoctl.methods.bounded import End, FreeEntries
@@ -36,7 +36,7 @@ class Near:
 class Transfer:
     """A plant, a program, the limits and bounds of a plan, and its ends.
 
-    Inputs of the plant act at once; `limits` are those of magnitudes and of rates, {actuator: (low, high)} each;
+    Inputs of the plant act at once; `limits` are those of actuators and of their rates, (low, high) by name;
     `bounds`, `start` and `end` are as for `relaxed`. The state at t0 is `begin` (n_x,), or near it where it is open,
     and then `opening`, of (t, x), vanishes there; `held` (m,) are the inputs that hold it at rest, None if it may move.
     `target` is what is fixed at t1: state (n_x,), NaN where it is open, inputs (m,) or None, and a function of
@@ -46,7 +46,7 @@ class Transfer:
 
     def __init__(self, plant, program, span, limits, bounds, start, end):
         self.plant, self.program, self.span, self.end = plant, program, span, end
-        self.limits, self.rates = limits
+        self.limits = limits
         self.n, self.m, self.nq = plant.n_x, len(plant.inputs), plant.mechanism.q.nq
         self.bounds = {name: interval(name, value, "bound") for name, value in mapping(bounds, "The bounds").items()}
         self.node = Node(plant, program, self._bounded())
@@ -164,9 +164,8 @@ class Transfer:
         if isinstance(self.end, str) and self.end == "free":
             return open_, None, None
         if isinstance(self.end, Mapping):
-            for name, value in self.end.items():
-                named(name, self.plant.state_names, "state")
-                open_[self.plant.state_names.index(name)] = finite(name, value, "value at the end")
+            given = numbers_by_name(self.end, self.plant.state_names, "state", "value at the end")
+            open_[[self.plant.state_names.index(name) for name in given]] = [*given.values()]
             return open_, None, None
         if isinstance(self.end, str) and self.end == "bounded":
             return open_, None, self._without_growth()
@@ -188,23 +187,33 @@ class Transfer:
         open_[self.nq :] = 0.0
         return open_, held, self._independent(rest[: self.nq], held)
 
+    def _unstable(self, t, x, of_start):
+        """What the program leaves free at a state, its tangent, and its unstable modes (k, f); None if there are none.
+
+        Of a start the modes are directions in which motions grow, of an end rows that vanish where none does.
+        """
+        try:
+            entries = FreeEntries(self._exact_model, t, x)
+        except ServoError:
+            return None
+        with np.errstate(all="ignore"):
+            _, (A,), _, (tangent,) = entries.local(np.array([t]), x[:, None])
+        if not np.isfinite(A).all():
+            return None
+        modes = End(t, x, A.T if of_start else A, entries.size[entries.free]).left_space(unstable=True)
+        return (entries, tangent, modes) if len(modes) else None
+
     def _opening(self, start):
         """A function of (t, x) that vanishes on the program for all values of the unstable modes; None if none are.
 
         Of the entries of the state that the program leaves free, the directions of unstable modes at the start are
         open, and what complements them is that of the start.
         """
-        try:
-            model = self._exact_model
-            entries, values = FreeEntries(model, start.t, start.values), np.asarray(start.values, dtype=float)
-        except ServoError:
+        values = np.asarray(start.values, dtype=float)
+        found = self._unstable(start.t, values, of_start=True)
+        if found is None or tuple(self._exact_model.state_names) != tuple(self.plant.state_names):
             return None
-        A, _ = _linearised(entries, start.t, values)
-        if tuple(model.state_names) != tuple(self.plant.state_names) or not np.isfinite(A).all():
-            return None
-        opened = End(start.t, values, A.T, entries.size[entries.free]).left_space(unstable=True)  # right space of A
-        if not len(opened):
-            return None
+        (entries, _, opened), model = found, self._exact_model
         closed = np.linalg.svd(opened)[2][len(opened) :]
         t, x, free = self.node.q.t, self.node.state, entries.free.tolist()
         on_program = model.function("invariants").expression(t, x, model.parameters)[: entries.m]
@@ -217,22 +226,19 @@ class Transfer:
         The exact plan from a start near its bounded motion has modes that grow until the end. Their values there are
         open to tiny changes of the program; fixed, they leave a layer of a few time constants at the end.
         """
+        x, t1 = self.states[:, -1], self.span[1]
         try:
-            model, x = self._exact_model, self.states[:, -1]
+            model = self._exact_model
             near = dict(zip(self.plant.state_names, x, strict=True))
-            near = {name: near.get(name, 0.0) for name in model.state_names}
-            state = np.asarray(model.start(self.span[1], guess=near).values)
-            entries = FreeEntries(model, self.span[1], state)
+            state = model.start(t1, guess={name: near.get(name, 0.0) for name in model.state_names})
         except ServoError:
             return None
-        A, tangent = _linearised(entries, self.span[1], state)
-        if not A.size or not np.isfinite(A).all():
+        found = self._unstable(t1, np.asarray(state.values), of_start=False)
+        if found is None:
             return None
-        modes = End(self.span[1], state, A, entries.size[entries.free]).left_space(unstable=True)
+        _, tangent, modes = found
         places = [model.state_names.index(name) for name in self.plant.state_names]
         rows = modes @ np.linalg.pinv(tangent[places])
-        if not len(rows):
-            return None
         return self.node.function("unstable", ca.DM(rows) @ (self.node.state - ca.DM(x)))
 
     def _require_bounds_at_ends(self):
@@ -342,13 +348,6 @@ class Transfer:
     def begin_inputs(self):
         """Inputs that hold the start at rest (m,), or zeros."""
         return np.zeros(self.m) if self.held is None else self.held
-
-
-def _linearised(entries, t, x):
-    """The internal dynamics at a state: linearisation (f, f), not finite where singular, and tangent (n_x, f)."""
-    with np.errstate(all="ignore"):
-        _, A, _, tangent = entries.local(np.array([t]), x[:, None])
-    return A[0], tangent[0]
 
 
 def _at_each(f, t, x, v):

@@ -9,8 +9,6 @@ the right half plane through the imaginary axis, or through infinity where the h
 the relative degree. No rank is decided, and nothing is divided by a pivot.
 """
 
-import bisect
-
 import casadi as ca
 import numpy as np
 
@@ -35,7 +33,7 @@ class ZeroPolynomial:
         self.model, self.parameter, self.t, self.nq = model, parameter, at.t, model.nq
         self.own = model.numbers[parameter]
         self.rests, (self._rates, self._parts, self.degree) = Rests.of_model(model), _equations(model)
-        self._values, self._ordered = {}, [self.own]  # of all with an equilibrium, ascending
+        self._values = {}
         self._known = {self.own: self._rest(self.own, at.values[: self.nq])}
         self._require_equilibrium(at)
         self.low, self.high, self.radius, self._scales = 0, self.degree, 1.0, None
@@ -84,10 +82,8 @@ class ZeroPolynomial:
     def equilibrium(self, value):
         """[q; μ] for a value, continued from the nearest value that is known."""
         if value not in self._known:
-            place = bisect.bisect(self._ordered, value)
-            nearest = min(self._ordered[max(0, place - 1) : place + 1], key=lambda known: abs(known - value))
+            nearest = min(self._known, key=lambda known: abs(known - value))
             self._known[value] = self._rest(value, self._known[nearest][: self.nq])
-            self._ordered.insert(place, value)
         return self._known[value]
 
     def follow(self, values):
