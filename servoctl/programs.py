@@ -221,10 +221,8 @@ def curvature(name, q, position, value):
     dict of str to SX
         One residual [1/m], without a value at rest: (x' y'' - y' x'')/|v|^3 - curvature.
     """
-    v, a = (_rate_of(name, q, position, k) for k in (1, 2))
-    _require_plane(name, v)
     (value,) = column(value, f"the curvature of {name!r}", 1)
-    return {name: (v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5 - value}
+    return {name: _curvature(name, q, position) - value}
 
 
 def curvature_rate(name, q, position, value):
@@ -244,10 +242,8 @@ def curvature_rate(name, q, position, value):
     dict of str to SX
         One residual [1/(m s)].
     """
-    v, a = (_rate_of(name, q, position, k) for k in (1, 2))
-    _require_plane(name, v)
     (value,) = column(value, f"the rate of {name!r}", 1)
-    return {name: q.dt((v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5) - value}
+    return {name: q.dt(_curvature(name, q, position)) - value}
 
 
 def perpendicular_velocities(name, q, a, b):
@@ -437,23 +433,14 @@ def posture(mechanism, at, rate):
 
 def _frame(frame):
     """Position and rotation of a frame, or of a pair."""
-    if isinstance(frame, Frame):
-        return frame.position, frame.rotation
-    if not isinstance(frame, tuple) or len(frame) != 2:
-        raise SpecificationError(
-            f"The frame is a {type(frame).__name__}.",
-            "It is a Frame, or a pair of a position and a rotation.",
-            do="Write robot.frame(link), or (position, rotation).",
-            type=type(frame).__name__,
-        )
-    return frame
+    if isinstance(frame, tuple) and len(frame) == 2:
+        return frame
+    frame = require_kind(Frame, "The frame", frame, "robot.frame(link), or write (position, rotation)")
+    return frame.position, frame.rotation
 
 
 def _vector(value, what):
-    entries = column(value, what)
-    if not 1 <= len(entries) <= 3:
-        raise SpecificationError(f"{what} has {len(entries)} entries.", "A point has one to three.", what=what)
-    return ca.vertcat(*entries)
+    return ca.vertcat(*column(value, what, 1, 2, 3))
 
 
 def _rate_of(name, q, position, k):
@@ -465,25 +452,16 @@ def _rate_of(name, q, position, k):
 def _norm(name, vector, value, what):
     """(|v|^2 - c^2)/(2 c)."""
     (value,) = column(value, f"the value of {name!r}", 1)
-    if value.is_constant() and float(value) <= 0.0:
-        raise SpecificationError(
-            f"{name!r} programs {what} of {float(value):g}.",
-            "It is positive: at zero the gradient of a norm has no direction.",
-            do="Program the components instead.",
-            name=name,
-            value=float(value),
-        )
+    if value.is_constant():  # at zero the gradient of a norm has no direction
+        positive(f"{what} of {name!r}", float(value))
     return (ca.dot(vector, vector) - value**2) / (2 * value)
 
 
-def _require_plane(name, vector):
-    if vector.numel() != 2:
-        raise SpecificationError(
-            f"The point of {name!r} has {vector.numel()} coordinates.",
-            "The curvature of a path has a sign in the plane alone.",
-            do="Give its two coordinates in the plane.",
-            name=name,
-        )
+def _curvature(name, q, position):
+    """The curvature of the path of a point, which has a sign in the plane alone."""
+    x, y = column(position, f"the position of {name!r}", 2)
+    v, a = (_rate_of(name, q, (x, y), k) for k in (1, 2))
+    return (v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5
 
 
 def _require_equal(name, a, b):

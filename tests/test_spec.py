@@ -232,7 +232,7 @@ def test_an_integer_mass_position_or_a_number_makes_a_body():
         (lambda q: sv.rigid_body(q, 1.0, (1, 1, 1), rates=(0, 0, 1), rotation=ca.SX.eye(3)), ["both"]),
         (lambda q: sv.rigid_body(q, 1.0, (1, 1), rates=(0, 0, 1)), ["(2, 1)"]),
         (lambda q: sv.rigid_body(q, 1.0, (1, 1, 1), rates=(0, 1)), ["rates", "2 entries", "3"]),
-        (lambda q: sv.rigid_body(q, 1.0, (1, 1, 1), rotation=ca.SX.eye(2)), ["(2, 2)", "3 by 3"]),
+        (lambda q: sv.rigid_body(q, 1.0, (1, 1, 1), rotation=ca.SX.eye(2)), ["(2, 2)", "(3, 3)"]),
     ],
 )
 def test_bodies_of_wrong_shape_are_refused(make, facts):

@@ -10,7 +10,7 @@ from math import pi
 import casadi as ca
 
 import servoctl as sv
-from servoctl.errors import unknown
+from servoctl.checks import named
 
 COORDINATES = ("relative", "redundant")
 
@@ -131,9 +131,7 @@ def crane_3d(coordinates="relative"):
 
 
 def _relative(coordinates):
-    if coordinates not in COORDINATES:
-        raise unknown(coordinates, COORDINATES, "choice of coordinates")
-    return coordinates == "relative"
+    return named(coordinates, COORDINATES, "choice of coordinates") == "relative"
 
 
 def _hanging(trolley, length, rope):

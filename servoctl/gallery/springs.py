@@ -3,7 +3,7 @@
 import casadi as ca
 
 import servoctl as sv
-from servoctl.errors import SpecificationError
+from servoctl.checks import array_of, whole
 
 
 def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
@@ -35,8 +35,7 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
     SpecificationError
         If there are fewer than two cars, or a list has a wrong length.
     """
-    if N < 2:
-        raise SpecificationError(f"A row of {N} cars.", "A spring joins two cars.", nearest="N = 2.", N=N)
+    N = whole("N", N, least=2)
     p = sv.parameters(
         **_numbered("m", "masses", masses, [1.0] * (N - 1) + [2.0]),  # kg
         **_numbered("k", "stiffnesses", stiffnesses, [1.0] * (N - 1)),  # N/m
@@ -59,9 +58,5 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
 
 
 def _numbered(letter, what, values, default):
-    values = default if values is None else list(values)
-    if len(values) != len(default):
-        raise SpecificationError(
-            f"There are {len(values)} {what}.", f"This row of cars has {len(default)}.", name=what, values=values
-        )
+    values = array_of(what, default if values is None else values, len(default)).tolist()
     return {f"{letter}{i}": value for i, value in enumerate(values, 1)}

@@ -275,15 +275,7 @@ def _linear_law(law, t, x, controller_state, name):
         at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}
     y, m, n_z = ordered(x, law.measures, "measurement", exactly=False), len(law.inputs), len(law.state)
-    z = as_numbers(law.state if controller_state is None else controller_state)
-    if z.shape != (n_z,):
-        raise SpecificationError(
-            f"The controller state has the shape {z.shape}.",
-            f"That of the law {law.name!r} has {n_z} numbers.",
-            do=f"Pass {', '.join(law.state_names) or 'none'}.",
-            shape=z.shape,
-            size=n_z,
-        )
+    z = array_of("controller_state", law.state if controller_state is None else controller_state, n_z)
     J = jacobian(law.step, "x", t, np.append(y, z), law.schedule_at(t))
     n_y = len(y)
     A, B, C, D = J[m : m + n_z, n_y:], J[m : m + n_z, :n_y], J[:m, n_y:], J[:m, :n_y]
@@ -341,14 +333,6 @@ def _linear_model(model, t, x, name):
     import control
 
     n, n_x, p = model.n, len(model.state_names), model.parameters
-    if x.shape != (n_x,):
-        raise SpecificationError(
-            f"The state has the shape {x.shape}.",
-            f"It has {n_x} numbers: {', '.join(model.state_names)}.",
-            do="Pass them in this order, as model.start(...) does.",
-            shape=x.shape,
-            names=model.state_names,
-        )
     ode = model.function("ode")
     A = jacobian(ode, "x", t, x, p)[:n_x]
     z, to_jets = np.append(x, ode(t, x, p)[n_x - n : n_x]), np.vstack([np.eye(n_x), A[-n:]])

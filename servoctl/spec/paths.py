@@ -18,7 +18,7 @@ import math
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_list, as_numbers, column, is_number, is_whole, named
+from servoctl.checks import as_list, as_numbers, column, named, positive, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.lookup import columns_at
 
@@ -544,40 +544,20 @@ def _column(value, what):
 
 def _scalar(value, what):
     """An SX scalar: an expression, or a finite number."""
-    value = _column(value, what)
-    if value.numel() != 1:
-        raise SpecificationError(
-            f"{what} has {value.numel()} entries.",
-            f"A path is an expression of one scalar {what}.",
-            do="Use q.t, a scalar path, a parameter or a number; a casadi.Function of a path tabulates it.",
-            what=what,
-            size=value.numel(),
-        )
-    return value
+    return column(value, what, 1)[0]
 
 
 def _positive(value, what):
     """An SX scalar that is an expression, or a number greater than zero."""
     value = _scalar(value, what)
-    if value.is_constant() and float(value) <= 0:
-        nearest = f"{what} = {-float(value):g}." if float(value) < 0 else ""
-        raise SpecificationError(
-            f"{what} = {value}.", f"The {what} of a path is positive.", nearest, what=what, value=float(value)
-        )
+    if value.is_constant():
+        positive(what, float(value))
     return value
 
 
 def _smoothness(k, least=0, most=SMOOTHEST):
     """The k of a class C^k as an int."""
-    if not is_whole(k) or not least <= k <= most:
-        raise SpecificationError(
-            f"smoothness={k!r}."[:200],
-            f"The smoothness k of a path of class C^k is a whole number, at least {least} and at most {most}.",
-            f"smoothness={min(max(least, math.ceil(k)), most)}." if is_number(k) else "",
-            "The error for a path of too low a class names the class that a program needs.",
-            smoothness=k,
-        )
-    return int(k)
+    return whole_of("smoothness", k, range(least, most + 1))
 
 
 def _orthonormal(axes, centre):
