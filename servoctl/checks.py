@@ -118,6 +118,14 @@ def require_kind(kind, name, value, source):
     return value
 
 
+def without_effect(options, where):
+    """Refuse the names of options that are given where they do nothing: `where` ends the sentence, "for a Law"."""
+    if options:
+        raise SpecificationError(
+            f"{', '.join(options)} was given {where}.", "It would have no effect.", do="Leave it out.", options=options
+        )
+
+
 def text(name, value):
     """The value, if it is a text of whole characters."""
     if not isinstance(value, str) or any("\ud800" <= letter <= "\udfff" for letter in value):
@@ -356,15 +364,10 @@ def whole_of(name, value, valid):
         raise SpecificationError(
             f"{name}={value!r} was given.",
             f"It is a whole number {span}.",
-            nearest=f"{name}={_nearest(valid, value)}." if is_number(value) else "",
+            nearest=f"{name}={min(valid, key=lambda number: abs(number - value))}." if is_number(value) else "",
             **{name: value},
         )
     return int(value)
-
-
-def _nearest(valid, value):
-    within = min(max(value, min(valid)), max(valid))
-    return min(valid, key=lambda number: abs(number - within))
 
 
 def whole_multiple(number, what, of):

@@ -588,7 +588,7 @@ def test_wishes_that_are_no_actuation_are_refused(wish):
 
 def test_wishes_of_accelerations_are_refused():
     mechanism, program = ship(3, ("X", "Y"))
-    with refused(SpecificationError, name="fore", order=2):
+    with refused(SpecificationError, what="The wish of 'fore'", order=2):
         sv.derive(mechanism, sv.Program(program.residuals, toward={"fore": mechanism.q.d(2)[0]}))
 
 

@@ -322,11 +322,15 @@ def _side_by_side(picture, each, ax, title):
 
 def shows_mechanism(run) -> bool:
     """Whether `animate` and `stroboscope` can draw a run: it has samples, and its mechanism shapes or positions."""
-    model = run.plant if hasattr(run, "commands") else run.model
-    if model is None or not len(run.t):
-        return False
-    mechanism = model.mechanism if hasattr(run, "commands") else model.reduction.mechanism
-    return bool(mechanism.shapes or _positions(mechanism))
+    mechanism, _ = _mechanism(run)
+    return mechanism is not None and len(run.t) > 0 and bool(mechanism.shapes or _positions(mechanism))
+
+
+def _mechanism(run):
+    """The mechanism of a run or a closed loop, and the numbers of its parameters; None of a run without its model."""
+    if hasattr(run, "commands"):
+        return run.plant.mechanism, run.plant.parameters
+    return (None, ()) if run.model is None else (run.model.reduction.mechanism, run.model.parameters)
 
 
 def _positions(mechanism):
@@ -350,16 +354,11 @@ def _spread(run, count):
 
 def _postures(run, t):
     """The mechanism of a run, its parameters, and its coordinates (nq, N) at some instants."""
-    if hasattr(run, "commands"):
-        mechanism, p = run.plant.mechanism, run.plant.parameters
-        q = np.array([np.interp(t, run.t, run[name]) for name in mechanism.q.names])
+    mechanism, p = _mechanism(run)
+    if hasattr(run, "commands") or len(run.t) >= PATH_POINTS:  # straight between samples: that cannot be seen
+        q = np.array([np.interp(t, *_ascending(run, name)) for name in mechanism.q.names])
     else:
-        mechanism, p = run.model.reduction.mechanism, run.model.parameters
-        names = run.jet_names[: run.model.nq]
-        if len(run.t) >= PATH_POINTS:  # straight between samples: the difference cannot be seen
-            q = np.array([np.interp(t, *_ascending(run, name)) for name in names])
-        else:
-            q = np.array([run.at(instant)[: len(names)] for instant in t]).T
+        q = np.array([run.at(instant)[: mechanism.q.nq] for instant in t]).T
     return mechanism, np.asarray(p)[: len(mechanism.parameters.names)], q
 
 

@@ -148,9 +148,7 @@ def as_drift(value):
     if value is None or isinstance(value, (Poles, Project)):
         return value
     if isinstance(value, str):
-        if value not in SHORT_FORMS:
-            raise unknown(value, [*SHORT_FORMS, "a time constant [s]"], "drift treatment")
-        return SHORT_FORMS[value]
+        return SHORT_FORMS[named(value, SHORT_FORMS, "drift treatment")]
     return Poles(value)
 
 

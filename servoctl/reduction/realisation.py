@@ -240,14 +240,7 @@ def _require_choices(mechanism, program):
     if program.metric == "inertia":
         _require_inertial(mechanism, program)
     for name, wish in program.toward.items():
-        if mechanism.q.order(ca.SX(wish)) > 1:
-            raise SpecificationError(
-                f"The wish of {name!r} contains accelerations or higher derivatives.",
-                "A wish is a force that is known before the accelerations: an expression of t, q and γ'.",
-                do="Write it by coordinates and velocities.",
-                name=name,
-                order=mechanism.q.order(ca.SX(wish)),
-            )
+        mechanism.q.require_order(ca.SX(wish), f"The wish of {name!r}", 1)
     if program.toward and len(program.residuals) == len(mechanism.actuators):
         raise SpecificationError(
             f"There are wishes of {', '.join(program.toward)}, and {len(program.residuals)} residuals determine the "

@@ -243,11 +243,9 @@ class Robot:
         while body is not None:
             rotation, arm = self._kinematics.rotations[body], position - self._kinematics.offsets[body]
             axis = self._axes[body]
-            directions = ca.horzsplit(rotation) * 2 if axis.motion == "free" else [rotation[:, 2]]
-            for k, ((row, factor), e) in enumerate(zip(axis.rows, directions, strict=True)):
-                slides = axis.motion == "slide" or axis.motion == "free" and k < 3
-                column = ca.vertcat(e, ca.SX.zeros(3)) if slides else ca.vertcat(ca.cross(e, arm), e)
-                result[:, row] += factor * column
+            for (row, factor), unit in zip(axis.rows, axis.units, strict=True):
+                turn, slide = (rotation @ part for part in unit)
+                result[:, row] += factor * ca.vertcat(slide + ca.cross(turn, arm), turn)
             body = self._tree.bodies[body].parent
         return result
 

@@ -140,13 +140,7 @@ def _refuse_rates(q, omega, alpha, J):
 def _acceleration(q, position, what):
     require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
     position = ca.vertcat(*column(position, what, 1, 2, 3))
-    if q.order(position) > 0:
-        raise SpecificationError(
-            f"{what.capitalize()} depends on velocities.",
-            "A position is a function of the coordinates and t.",
-            do="Pass the position; velocities and accelerations are derived.",
-            order=q.order(position),
-        )
+    q.require_order(position, what, 0)
     return q.dt(position, 2)
 
 

@@ -558,16 +558,8 @@ class Mechanism(Shown):
                     entries=len(items),
                 )
             expression = self._known(items, what, len(items))
-            order = self.q.order(expression)
-            if order > 0:
-                raise SpecificationError(
-                    f"The {'direction' if direction else 'displacement'} of {what} depends on velocities.",
-                    "Displacements and directions are functions of q and t.",
-                    do="Use the coordinates instead of the velocities.",
-                    name=name,
-                    order=order,
-                )
-            if not direction and order < 0:
+            self.q.require_order(expression, f"The {'direction' if direction else 'displacement'} of {what}", 0)
+            if not direction and self.q.order(expression) < 0:
                 raise SpecificationError(
                     f"The displacement of {what} depends on no coordinate.",
                     "An actuator works on a displacement, or along a direction of n entries.",
@@ -588,15 +580,8 @@ class Mechanism(Shown):
             ("The shape", self.shapes, 0),
         ):
             for name, expression in items.items():
-                if expression is not None and self.q.order(expression) > limit:
-                    raise SpecificationError(
-                        f"{what}{f' {name!r}' if name else ''} has order {self.q.order(expression)} in the jets.",
-                        f"Its order is at most {limit}.",
-                        do="Use lower derivatives; constraints of higher order are program constraints.",
-                        name=name,
-                        order=self.q.order(expression),
-                        limit=limit,
-                    )
+                if expression is not None:
+                    self.q.require_order(expression, f"{what}{f' {name!r}' if name else ''}", limit)
 
     def _keep_names_apart(self):
         """Give longer names to actuators, outputs and parameters that bear the name of a signal before them."""

@@ -12,7 +12,6 @@ arguments. A path along a time law has the lower of both classes.
 """
 
 import functools
-import itertools
 import math
 
 import casadi as ca
@@ -415,32 +414,21 @@ def _require_passing(pieces, points, half):
 def _from_ends(m):
     """Polynomials of degree 2m + 1 on (-1, 1) by their Taylor coefficients 0 .. m at -1, then at 1.
 
-    Returns the powers 0 .. 2m + 1 (rows) of each, and the integrals of products of their derivatives m + 1; both are
-    computed in fractions.
+    Returns the powers 0 .. 2m + 1 (rows) of each, and the integrals of products of their derivatives m + 1, those of
+    degree 2m by Gauss. That of coefficient j at -1 is (1 + x)^j r^(m + 1) sum_(k=0..m-j) binomial(m + k, k) l^k with
+    l = (1 + x)/2 and r = (1 - x)/2; those at 1 are its mirror images.
     """
-    from fractions import Fraction
-
-    size = 2 * m + 2
-    rows = [
-        [Fraction(math.comb(p, j) * side ** (p - j)) if p >= j else Fraction(0) for p in range(size)]
-        for side in (-1, 1)
-        for j in range(m + 1)
-    ]
-    rows = [row + [Fraction(int(i == j)) for j in range(size)] for i, row in enumerate(rows)]
-    for k in range(size):
-        pivot = next(i for i in range(k, size) if rows[i][k])
-        rows[k], rows[pivot] = rows[pivot], rows[k]
-        rows[k] = [e / rows[k][k] for e in rows[k]]
-        for i in set(range(size)) - {k}:
-            rows[i] = [e - rows[i][k] * f for e, f in zip(rows[i], rows[k], strict=True)]
-    powers = np.array([row[size:] for row in rows])
-    falling = [math.perm(p, m + 1) for p in range(size)]
-    products = np.full((size, size), Fraction(0))
-    for p, r in itertools.product(range(m + 1, size), repeat=2):
-        if (p + r) % 2 == 0:
-            products[p, r] = Fraction(2 * falling[p] * falling[r], p + r - 2 * m - 1)
-    energy = powers.T @ products @ powers
-    return powers.astype(float), (energy / energy[0, 0]).astype(float)
+    x = np.polynomial.Polynomial([0.0, 1.0])
+    left, right = (1 + x) / 2, (1 - x) / 2
+    basis = []
+    for j in range(m + 1):
+        series = sum(math.comb(m + k, k) * left**k for k in range(m + 1 - j))
+        basis.append((1 + x) ** j * right ** (m + 1) * series)
+    basis += [(-1) ** j * polynomial(-x) for j, polynomial in enumerate(basis)]
+    nodes, weights = np.polynomial.legendre.leggauss(m + 1)
+    slopes = np.array([polynomial.deriv(m + 1)(nodes) for polynomial in basis])
+    energy = slopes * weights @ slopes.T
+    return np.column_stack([polynomial.coef for polynomial in basis]), energy / energy[0, 0]
 
 
 def _symbolic_pieces(times, points, m, ends):

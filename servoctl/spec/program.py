@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, mapping, named, positive, require_kind
+from servoctl.checks import column, finite, mapping, named, positive, require_kind, without_effect
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import as_text, without_turns
 from servoctl.jets.overflow import settled
@@ -58,14 +58,8 @@ class Program(Packed):
             )
         named(by, REALISATIONS, "realisation")
         mapping(residuals, "The residuals")
-        for what, chosen in (("weights", weights), ("wishes", toward)):
-            if chosen is not None and by != "actuators":
-                raise SpecificationError(
-                    f"The program with by={by!r} has {what}.",
-                    "Weights and wishes choose among actuators.",
-                    do=f"Remove the {what}, or write by='actuators'.",
-                    by=by,
-                )
+        chosen = [name for name, value in (("weights", weights), ("toward", toward)) if value is not None]
+        without_effect(chosen if by != "actuators" else [], f"with by={by!r}: they choose among actuators")
         self.with_turns = {name: _residual(name, value) for name, value in residuals.items()}
         self.residuals = {name: without_turns(value) for name, value in self.with_turns.items()}
         self.by = by

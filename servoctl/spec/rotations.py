@@ -9,7 +9,7 @@ With a time law from `servoctl.paths` as the argument they are orientations to b
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import array_of, as_numbers, column, matrix
+from servoctl.checks import array_of, column, matrix
 from servoctl.errors import SpecificationError
 from servoctl.spec import paths
 
@@ -191,9 +191,8 @@ def _axis_and_angle(rotation, what="start and end"):
 
 def _matrix_of_numbers(value, what):
     """A rotation of numbers, (3, 3) array."""
-    array = as_numbers(value)
-    proper = array.shape == (3, 3) and np.isfinite(array).all() and np.linalg.det(array) > 0.0
-    if not proper or np.abs(array.T @ array - np.eye(3)).max() > ORTHONORMAL:
+    array = array_of(what, value, 3, 3)
+    if not np.linalg.det(array) > 0.0 or np.abs(array.T @ array - np.eye(3)).max() > ORTHONORMAL:
         raise SpecificationError(
             f"{what} is no rotation: {array.tolist()}."[:300],
             "A rotation matrix has orthonormal columns and determinant 1.",
