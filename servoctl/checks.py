@@ -305,15 +305,18 @@ def _as_float(value):
         return math.nan
 
 
-def within(name, value, least=-math.inf, most=math.inf, above=-math.inf):
-    """A finite float from a number, at least `least`, at most `most` and greater than `above`."""
+def within(name, value, least=-math.inf, most=math.inf, above=-math.inf, given=""):
+    """A finite float from a number, at least `least`, at most `most` and greater than `above`.
+
+    `given` begins the message, by default "NAME=VALUE was given."
+    """
     number = _as_float(value)
     if not (math.isfinite(number) and least <= number <= most and number > above):
         sides = {"greater than": above, "at least": least, "at most": most}
         rule = " and ".join(f"{words} {bound:g}" for words, bound in sides.items() if math.isfinite(bound))
         nearest = min(max(number, least), most)
         raise SpecificationError(
-            f"{name}={repr(value)[:150]} was given.",
+            given or f"{name}={repr(value)[:150]} was given.",
             f"It is a finite number {rule}.",
             nearest=f"{name}={nearest:g}." if above < nearest != number else "",
             name=name,
@@ -342,8 +345,15 @@ def whole(name, value, least=0, most=math.inf):
     number = int(value) if is_number(value) or is_whole(value) else least - 1
     if not least <= number <= most or number != value:
         rule = f"It must be a whole number, at least {least}{f' and at most {most}' if most < math.inf else ''}."
-        said, nearest = f"{name}={value!r} was given."[:200], f"{name}={most}." if number > most else ""
-        raise SpecificationError(said, rule, nearest=nearest, name=name, value=value, least=least, most=most)
+        raise SpecificationError(
+            f"{name}={value!r} was given."[:200],
+            rule,
+            nearest=f"{name}={min(max(number, least), most)}." if is_number(value) else "",
+            name=name,
+            value=value,
+            least=least,
+            most=most,
+        )
     return number
 
 
@@ -409,7 +419,8 @@ def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
     """Finite numbers by name, none below `low`: each `what` ("actuator") has a `meaning` ("lag")."""
     numbers = {}
     for name, value in by_name(values, names, what, f"The {meaning}s").items():
-        numbers[name] = within(name, finite(name, value, meaning), low, above=0.0 if positive else -math.inf)
+        number, given = finite(name, value, meaning), f"The {meaning} of {name!r} is {value!r}."
+        numbers[name] = within(name, number, low, above=0.0 if positive else -math.inf, given=given)
     return numbers
 
 

@@ -73,8 +73,7 @@ def follow_path(name, position, path, along):
             do="Write lambda s: sv.paths.line(s, start, end); for an expression of time, use follow_point.",
             name=name,
         )
-    (along,) = column(along, f"the parameter of {name!r}", 1)
-    return follow_point(name, position, path(along))
+    return follow_point(name, position, path(_scalar(along, f"the parameter of {name!r}")))
 
 
 def pose(name, frame, position, rotation):
@@ -221,8 +220,7 @@ def curvature(name, q, position, value):
     dict of str to SX
         One residual [1/m], without a value at rest: (x' y'' - y' x'')/|v|^3 - curvature.
     """
-    (value,) = column(value, f"the curvature of {name!r}", 1)
-    return {name: _curvature(name, q, position) - value}
+    return {name: _curvature(name, q, position) - _scalar(value, f"the curvature of {name!r}")}
 
 
 def curvature_rate(name, q, position, value):
@@ -242,8 +240,7 @@ def curvature_rate(name, q, position, value):
     dict of str to SX
         One residual [1/(m s)].
     """
-    (value,) = column(value, f"the rate of {name!r}", 1)
-    return {name: q.dt(_curvature(name, q, position)) - value}
+    return {name: q.dt(_curvature(name, q, position)) - _scalar(value, f"the rate of {name!r}")}
 
 
 def perpendicular_velocities(name, q, a, b):
@@ -282,8 +279,7 @@ def energy(name, mechanism, value):
         One residual [J].
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
-    (value,) = column(value, f"the energy of {name!r}", 1)
-    return {name: mechanism.energy - value}
+    return {name: mechanism.energy - _scalar(value, f"the energy of {name!r}")}
 
 
 def momentum(name, mechanism, coordinate, value):
@@ -307,8 +303,8 @@ def momentum(name, mechanism, coordinate, value):
     q = mechanism.q
     names = q.force_names
     named(coordinate, names, "coordinate" if q.plain else "quasi-velocity")
-    (value,) = column(value, f"the momentum of {name!r}", 1)
-    return {name: (mechanism.mass @ ca.vertcat(*q.gamma(1)))[names.index(coordinate)] - value}
+    momenta = mechanism.mass @ ca.vertcat(*q.gamma(1))
+    return {name: momenta[names.index(coordinate)] - _scalar(value, f"the momentum of {name!r}")}
 
 
 def formation(name, leader, followers, offsets):
@@ -389,7 +385,7 @@ def wish(mechanism, accelerations=None):
     wanted = dict.fromkeys(names, ca.SX(0))
     for name, value in mapping(accelerations, "The accelerations").items():
         named(name, names, "coordinate" if q.plain else "quasi-velocity")
-        (wanted[name],) = column(value, f"the acceleration of {name!r}", 1)
+        wanted[name] = _scalar(value, f"the acceleration of {name!r}")
     balance = ca.substitute(mechanism.balance, q.jet(2), ca.vertcat(*wanted.values()))
     forces = cse(inverse @ balance)
     return dict(zip(mechanism.actuators, forces.elements(), strict=True))
@@ -427,7 +423,7 @@ def posture(mechanism, at, rate):
     drawn = {name: -2.0 * rate * w for name, w in zip(q.names, q.gamma(1), strict=True)}
     for name, value in mapping(at, "The posture").items():
         named(name, q.names, "coordinate")
-        drawn[name] -= rate**2 * (q[name] - column(value, f"the wish of {name!r}", 1)[0])
+        drawn[name] -= rate**2 * (q[name] - _scalar(value, f"the wish of {name!r}"))
     return wish(mechanism, drawn)
 
 
@@ -443,6 +439,10 @@ def _vector(value, what):
     return ca.vertcat(*column(value, what, 1, 2, 3))
 
 
+def _scalar(value, what):
+    return column(value, what, 1)[0]
+
+
 def _rate_of(name, q, position, k):
     """The k-th derivative of a point."""
     require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
@@ -451,7 +451,7 @@ def _rate_of(name, q, position, k):
 
 def _norm(name, vector, value, what):
     """(|v|^2 - c^2)/(2 c)."""
-    (value,) = column(value, f"the value of {name!r}", 1)
+    value = _scalar(value, f"the value of {name!r}")
     if value.is_constant():  # at zero the gradient of a norm has no direction
         positive(f"{what} of {name!r}", float(value))
     return (ca.dot(vector, vector) - value**2) / (2 * value)

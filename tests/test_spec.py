@@ -336,7 +336,7 @@ def test_a_quadratic_gibbs_function_in_disguise_is_accepted():
         ({"gibbs": "d3x"}, ["Gibbs", "order 3"]),
         ({"gibbs": "S", "constraints": {"rail": "d3x"}}, ["rail", "order 3"]),
         ({"gibbs": "S", "actuators": {"rail": "dx"}}, ["order 1"]),
-        ({"gibbs": "S", "actuators": {"rail": (1, 0)}}, ["'rail' has 2 entries", "one for each of dx;", "scalar"]),
+        ({"gibbs": "S", "actuators": {"rail": (1, 0)}}, ["'rail' along dx has 2 entries"]),
         ({"gibbs": "S", "actuators": 3}, ["The actuators are 3"]),
         ({"gibbs": "S", "actuators": {"rail": "t"}}, ["rail", "no coordinate"]),
         ({"gibbs": "S", "actuators": {"x": "x", "x_input": "x"}}, ["'x'", "'x_input'", "actuator"]),

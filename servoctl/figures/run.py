@@ -267,8 +267,7 @@ def over_time(run, groups, ax, units, extrema=False):
             panel.plot(run.t, run[name], label=label_of([name], units if mixed else {}), **look(i))
         of_unit = max(largest[unit_of(name, units)] for name in group)
         _frame(panel, run, group, max(largest.values()) if of_unit < VISIBLE * max(largest.values()) else of_unit)
-        panel.set_ylabel(label_of(group, units))
-        panel.grid(alpha=0.3)
+        finish(panel, ylabel=label_of(group, units))
         if len(group) > 1:
             panel.legend(**BESIDE)
         if extrema:

@@ -1,7 +1,7 @@
 """The figure of sensitivities."""
 
 from servoctl.figures.names import label_of, units_in
-from servoctl.figures.style import BESIDE, as_panels, high, look
+from servoctl.figures.style import BESIDE, as_panels, finish, high, look
 
 
 def draw_sensitivity(sensitivity, ax=None, units=None):
@@ -12,8 +12,7 @@ def draw_sensitivity(sensitivity, ax=None, units=None):
         for i, to in enumerate(sensitivity.to):
             step = "1 %" if sensitivity.number(to) else "0.01"
             panel.plot(sensitivity.t, sensitivity.change(to) * sensitivity[name, to], label=f"{to} + {step}", **look(i))
-        panel.set_ylabel(f"change of {label_of([name], units)}")
-        panel.grid(alpha=0.3)
+        finish(panel, ylabel=f"change of {label_of([name], units)}")
     axes[0].legend(**BESIDE)
     axes[-1].set_xlabel("t [s]")
     return axes

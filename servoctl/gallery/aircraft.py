@@ -5,7 +5,7 @@ from math import radians
 import casadi as ca
 
 import servoctl as sv
-from servoctl.checks import named
+from servoctl.errors import unknown
 
 POINTS = ("flat", "centre")
 
@@ -34,7 +34,8 @@ def vtol(point="flat"):
     The usual benchmark form: the tilt turns the difference of the thrusts sideways, and the factor cos(tilt) of
     their sum is left out.
     """
-    named(point, POINTS, "point of the aircraft")
+    if point not in POINTS:
+        raise unknown(point, POINTS, "point of the aircraft")
     p = sv.parameters(M=50.0, J=25.0, l=1.0, h=0.1, tilt=radians(5.0), g=9.81)  # kg, kg m^2, m, m, rad, m/s^2
     q = sv.coordinates("x z theta", units="m m rad")  # z up
     x, z, theta = q

@@ -10,7 +10,7 @@ from math import pi
 import casadi as ca
 
 import servoctl as sv
-from servoctl.checks import named
+from servoctl.errors import unknown
 
 COORDINATES = ("relative", "redundant")
 
@@ -131,7 +131,9 @@ def crane_3d(coordinates="relative"):
 
 
 def _relative(coordinates):
-    return named(coordinates, COORDINATES, "choice of coordinates") == "relative"
+    if coordinates not in COORDINATES:
+        raise unknown(coordinates, COORDINATES, "choice of coordinates")
+    return coordinates == "relative"
 
 
 def _hanging(trolley, length, rope):

@@ -5,7 +5,7 @@ from itertools import accumulate
 import casadi as ca
 
 import servoctl as sv
-from servoctl.checks import whole
+from servoctl.errors import SpecificationError
 
 
 def flexible_joint(friction=2.0):
@@ -68,7 +68,8 @@ def elastic_link(n=4):
     SpecificationError
         If there is no rod.
     """
-    n = whole("n", n, least=1)
+    if n < 1:
+        raise SpecificationError(f"A link of {n} rods.", "It has one at least.", nearest="n = 1.", n=n)
     p = sv.parameters(J=0.2, m=2.0, l=1.0, EI=20.0, tau=0.002)  # kg m^2 of the hub, kg, m, N m^2, s
     names = ["hub", *(f"bend{i}" for i in range(1, n + 1))]  # each from the one before
     q = sv.coordinates(" ".join(names), units="rad " * (n + 1))

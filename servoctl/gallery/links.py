@@ -9,7 +9,7 @@ from itertools import accumulate
 import casadi as ca
 
 import servoctl as sv
-from servoctl.checks import named, whole
+from servoctl.errors import SpecificationError, unknown
 
 COORDINATES = ("joints", "bodies")
 
@@ -150,8 +150,12 @@ def _placed(angles, rod):
 
 
 def _check(n, coordinates, least):
-    whole("n", n, least=least)
-    named(coordinates, COORDINATES, "kind of coordinates")
+    if n < least:
+        raise SpecificationError(
+            f"An arm of {n} links.", f"Its end point needs {least} joints.", nearest=f"n = {least}.", n=n
+        )
+    if coordinates not in COORDINATES:
+        raise unknown(coordinates, COORDINATES, "kind of coordinates")
 
 
 def _parameters():

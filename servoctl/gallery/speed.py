@@ -3,7 +3,7 @@
 import casadi as ca
 
 import servoctl as sv
-from servoctl.checks import named
+from servoctl.errors import unknown
 
 
 def constant_speed(realisation="ideal"):
@@ -26,7 +26,8 @@ def constant_speed(realisation="ideal"):
     NameUnknown
         If the realisation is another word.
     """
-    named(realisation, ("ideal", "horizontal"), "realisation")
+    if realisation not in ("ideal", "horizontal"):
+        raise unknown(realisation, ("ideal", "horizontal"), "realisation")
     p = sv.parameters(m=1.0, g=9.81, v=5.0)  # kg, m/s^2, m/s
     q = sv.coordinates("x y", units="m m")  # y up
     x, y = q

@@ -5,7 +5,7 @@ from math import factorial
 import casadi as ca
 
 import servoctl as sv
-from servoctl.checks import whole
+from servoctl.errors import SpecificationError
 
 
 def spiral(order=3, c=None):
@@ -30,7 +30,11 @@ def spiral(order=3, c=None):
     SpecificationError
         If the order is below 2.
     """
-    n = whole("order", order, least=2) - 2  # that of curvature itself is 2
+    if order < 2:
+        raise SpecificationError(
+            f"A spiral of order {order}.", "Curvature has order 2.", nearest="order = 2, a circle.", order=order
+        )
+    n = order - 2
     p = sv.parameters(m=1.0, c=factorial(n + 1) / 2 ** (n + 1) if c is None else c)  # kg, 1/(m s^n)
     q = sv.coordinates("x y", units="m m")
     x, y = q

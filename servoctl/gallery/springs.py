@@ -3,7 +3,7 @@
 import casadi as ca
 
 import servoctl as sv
-from servoctl.checks import array_of, whole
+from servoctl.errors import SpecificationError
 
 
 def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
@@ -35,7 +35,8 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
     SpecificationError
         If there are fewer than two cars, or a list has a wrong length.
     """
-    N = whole("N", N, least=2)
+    if N < 2:
+        raise SpecificationError(f"A row of {N} cars.", "A spring joins two cars.", nearest="N = 2.", N=N)
     p = sv.parameters(
         **_numbered("m", "masses", masses, [1.0] * (N - 1) + [2.0]),  # kg
         **_numbered("k", "stiffnesses", stiffnesses, [1.0] * (N - 1)),  # N/m
@@ -58,5 +59,9 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
 
 
 def _numbered(letter, what, values, default):
-    values = array_of(what, default if values is None else values, len(default)).tolist()
+    values = default if values is None else list(values)
+    if len(values) != len(default):
+        raise SpecificationError(
+            f"There are {len(values)} {what}.", f"This row of cars has {len(default)}.", name=what, values=values
+        )
     return {f"{letter}{i}": value for i, value in enumerate(values, 1)}

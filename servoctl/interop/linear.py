@@ -12,7 +12,7 @@ from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.errors import SpecificationError
 from servoctl.interop.names import (
-    SOURCE,
+    SYSTEMS,
     connected,
     disturbable_of,
     disturbed_names,
@@ -61,7 +61,7 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     NameUnknown
         For a disturbance of what is no generalised force or parameter.
     """
-    require_kind((Model, Plant, Law, Closed), "thing", thing, SOURCE)
+    require_kind((Model, Plant, Law, Closed), "thing", thing, SYSTEMS)
     given = {"x": x, "u": u, "controller_state": controller_state, "rate": rate}
     given["disturbed"] = as_list(disturbed) or None
     valid = next(options for kind, options in OPTIONS.items() if isinstance(thing, kind))
@@ -102,7 +102,7 @@ def along(thing, run, times=None, **options):
     SpecificationError
         For times outside the run, and as `linearise`.
     """
-    require_kind((Model, Plant, Law), "thing", thing, SOURCE)
+    require_kind((Model, Plant, Law), "thing", thing, SYSTEMS)
     require_kind((Run, Closed), "run", run, "sv.simulate(...) or sv.close(...)")
     times = run.t if times is None else array_of("times", np.atleast_1d(as_numbers(times)), None)
     if isinstance(run, Closed):

@@ -3,7 +3,7 @@
 from servoctl.checks import text, texts
 from servoctl.errors import SpecificationError
 
-SOURCE = "sv.derive, sv.plant, a law or sv.close"
+SYSTEMS = "sv.derive (run.model of a plan), sv.plant, a law such as sv.lqr, or sv.close"
 
 
 def output_names(plant):

@@ -11,7 +11,7 @@ from servoctl.control.loop import hold, limited, quantised, samples_ago
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.interop.names import (
-    SOURCE,
+    SYSTEMS,
     connected,
     disturbable_of,
     disturbed_names,
@@ -61,7 +61,7 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     NameUnknown
         For a disturbance of what is no generalised force or parameter.
     """
-    require_kind((Model, Plant, Law, Closed), "thing", thing, SOURCE)
+    require_kind((Model, Plant, Law, Closed), "thing", thing, SYSTEMS)
     if isinstance(thing, Plant):
         return _plant(thing, system_name(name, "plant"), disturbed, rate, substeps)
     given = {"rate": rate, "substeps": substeps, "disturbed": as_list(disturbed) or None}

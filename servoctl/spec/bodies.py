@@ -6,7 +6,7 @@ import numpy as np
 from servoctl.checks import column, matrix, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread
-from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.coordinates import Coordinates, require_order
 from servoctl.tolerances import ENTRY
 
 
@@ -140,7 +140,7 @@ def _refuse_rates(q, omega, alpha, J):
 def _acceleration(q, position, what):
     require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
     position = ca.vertcat(*column(position, what, 1, 2, 3))
-    q.require_order(position, what, 0)
+    require_order(q, position, what, 0)
     return q.dt(position, 2)
 
 

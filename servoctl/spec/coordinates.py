@@ -275,19 +275,6 @@ class Coordinates:
         places = map(self.where, symbols_in(expression))
         return max([-1, *(place[1] for place in places if place is not None and place[0] in "qw")])
 
-    def require_order(self, expression, what, most):
-        """Refuse an expression of higher derivatives than γ^(most); `what` it is begins the message."""
-        order = self.order(expression)
-        if order > most:
-            raise SpecificationError(
-                f"{what} has the order {order} in the jets.",
-                f"Its order is at most {most}: {('coordinates and t', 'velocities', 'accelerations')[min(most, 2)]}.",
-                do="Write it by lower derivatives, which are known where it is evaluated.",
-                what=what,
-                order=order,
-                limit=most,
-            )
-
     def derivatives(self, expressions, k):
         """Total derivatives of orders 0 to k by one propagation of Taylor series.
 
@@ -402,6 +389,20 @@ def _moved(names, units, velocity_names, frame, invariants, identity):
     moved = q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
     moved.identity = identity
     return moved
+
+
+def require_order(q, expression, what, most):
+    """Refuse an expression with higher derivatives of q than γ^(most); `what` it is begins the message."""
+    order = q.order(expression)
+    if order > most:
+        raise SpecificationError(
+            f"{what} has the order {order} in the jets.",
+            f"Its order is at most {most}: {('coordinates and t', 'velocities', 'accelerations')[min(most, 2)]}.",
+            do="Write it by lower derivatives, which are known where it is evaluated.",
+            what=what,
+            order=order,
+            limit=most,
+        )
 
 
 def _order(k, least=0):

@@ -459,20 +459,13 @@ def _symbolic_pieces(times, points, m, ends):
 def _via_points(times, points):
     """The times (n,) and points (n, dim) of a spline: arrays of numbers, or SX where they contain symbols."""
     times, points = _entries(times, "times"), _entries(points, "points")
-    if not all(isinstance(e, ca.SX) or np.isfinite(e).all() for e in (times, points)):
-        raise SpecificationError(
-            "The spline's times or points are not all finite numbers.",
-            "Times and points are numbers or expressions, of shapes (n,) and (n,) or (n, dim).",
-            do="Put points in rows, and their entries in columns.",
-            times=times,
-            points=points,
-        )
+    finite = all(isinstance(e, ca.SX) or np.isfinite(e).all() for e in (times, points))
     shapes = [e.shape[:1] if isinstance(e, ca.SX) and e.shape[1] == 1 else e.shape for e in (times, points)]
     fit = len(shapes[0]) == 1 and len(shapes[1]) in (1, 2) and shapes[0][0] == shapes[1][0] >= 2
-    if not fit or 0 in shapes[1]:
+    if not finite or not fit or 0 in shapes[1]:
         raise SpecificationError(
             f"The spline's times have the shape {shapes[0]}, its points {shapes[1]}.",
-            "There are at least two times, and one point for each.",
+            "There are at least two times, and one point for each: finite numbers or expressions.",
             do="Put points in rows, and their entries in columns.",
             times=shapes[0],
             points=shapes[1],

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, mapping, named, positive, require_kind, without_effect
+from servoctl.checks import column, finite, mapping, named, positive, require_kind, within, without_effect
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import as_text, without_turns
 from servoctl.jets.overflow import settled
@@ -175,7 +175,7 @@ def _weight(name, value):
         (weight,) = column(value, f"The weight of {name!r}", 1)
         if ca.symvar(weight):
             return weight
-    return positive(f"The weight of {name!r}", value)
+    return within(name, value, above=0.0, given=f"The weight of {name!r} is {value!r}.")
 
 
 def _wish(name, value):
