@@ -274,7 +274,7 @@ def test_the_plot_draws_every_number(cost, study):
         ({"methods": {"order": [8]}}, NameUnknown, "No method is named 'order'"),
         ({"methods": {"RK4": "fine"}}, SpecificationError, "step of RK4='fine' was given"),
         ({"methods": {"RK4": []}}, SpecificationError, "step of RK4=[] was given"),
-        ({"seconds": 0.0}, SpecificationError, "seconds = 0 was given"),
+        ({"seconds": 0.0}, SpecificationError, "seconds=0.0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),
         ({"drift": [sv.methods.Poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
         ({"t_span": (0.0, 0.0)}, SpecificationError, "two different finite times"),
