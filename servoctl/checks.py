@@ -33,8 +33,8 @@ SUFFIXES = {
 OF_REACTIONS = ("multiplier_", "reaction_")  # how names of their components begin
 
 
-def column(value, what, size=None):
-    """A list of SX scalars from a scalar, a sequence, or an SX column, of length `size` if that is given."""
+def column(value, what, *sizes):
+    """A list of SX scalars from a scalar, a sequence, or an SX column, of one of the sizes if some are given."""
     try:
         if isinstance(value, (list, tuple)):
             value = ca.vertcat(*map(_real, value)) if value else ca.SX(0, 1)
@@ -49,9 +49,9 @@ def column(value, what, size=None):
             what=what,
             type=kind,
         ) from error
-    if size is not None and len(items) != size:
-        given = f"{what} has {len(items)} entries."
-        raise SpecificationError(given, f"It needs {size}.", what=what, entries=len(items), size=size)
+    if sizes and len(items) not in sizes:
+        rule = f"It has {' or '.join(map(str, sizes))}."
+        raise SpecificationError(f"{what} has {len(items)} entries.", rule, what=what, entries=len(items), sizes=sizes)
     if _holds_no_number(flat):
         raise SpecificationError(
             f"{what} holds NaN or infinity.",
@@ -70,8 +70,8 @@ def _real(value):
     return value.astype(float) if kind == "f" else value
 
 
-def matrix(value, what):
-    """An SX matrix from a number, an SX matrix, an array, or nested sequences of scalars."""
+def matrix(value, what, *shapes):
+    """An SX matrix of one of the shapes from a number, a matrix, an array, or nested sequences."""
     try:
         if isinstance(value, (list, tuple)):
             rows = (map(_real, row) if isinstance(row, (list, tuple)) else [ca.SX(_real(row))] for row in value)
@@ -81,6 +81,9 @@ def matrix(value, what):
         rule, do = "It must be a matrix of numbers and expressions.", "Give rows of equal length."
         raise SpecificationError(f"{what} is {value!r}.", rule, do=do, what=what) from error
     column(ca.vec(result), what)
+    if shapes and result.shape not in shapes:
+        rule = f"Its shape is {' or '.join(map(str, shapes))}."
+        raise SpecificationError(f"{what} has the shape {result.shape}.", rule, what=what, shape=result.shape)
     return result
 
 
@@ -102,17 +105,25 @@ def mapping(value, what):
 
 
 def require_kind(kind, name, value, source):
-    """The value, if it is of a kind: a class, made by `source` ("sv.derive(...)")."""
+    """The value, if it is of a kind: a class or a tuple of classes, made by `source` ("sv.derive(...)")."""
     if not isinstance(value, kind):
-        article = "an" if type(value).__name__[0] in "aeiouAEIOU" else "a"
+        kinds = kind if isinstance(kind, tuple) else (kind,)
         raise SpecificationError(
-            f"{name} is {article} {type(value).__name__}.",
-            f"It must be a {kind.__name__}.",
+            f"{name} has the type {type(value).__name__}.",
+            f"It must be a {' or '.join(one.__name__ for one in kinds)}.",
             do=f"Make one by {source}.",
             name=name,
             type=type(value).__name__,
         )
     return value
+
+
+def without_effect(options, where):
+    """Refuse the names of options that are given where they do nothing: `where` ends the sentence, "for a Law"."""
+    if options:
+        raise SpecificationError(
+            f"{', '.join(options)} was given {where}.", "It would have no effect.", do="Leave it out.", options=options
+        )
 
 
 def text(name, value):
@@ -279,22 +290,44 @@ def plain(value):
 
 def finite(name, value, what="value"):
     """A finite float from a number; `what` it is, in the singular: "limit", "noise"."""
-    try:
-        number = math.nan if isinstance(value, (str, bytes)) else float(_real(value))
-    except Exception:  # CasADi raises its own types for symbols
-        number = math.nan
+    number = _as_float(value)
     if not math.isfinite(number):
         given, rule = f"The {what} {name!r} is {value!r}.", f"A {what} must be a finite number."
         raise SpecificationError(given, rule, name=name, type=type(value).__name__)
     return number
 
 
+def _as_float(value):
+    """A float from a number, NaN from anything else."""
+    try:
+        return math.nan if isinstance(value, (str, bytes)) else float(_real(value))
+    except Exception:  # CasADi raises its own types for symbols
+        return math.nan
+
+
+def within(name, value, least=-math.inf, most=math.inf, above=-math.inf, given=""):
+    """A finite float from a number, at least `least`, at most `most` and greater than `above`.
+
+    `given` begins the message, by default "NAME=VALUE was given."
+    """
+    number = _as_float(value)
+    if not (math.isfinite(number) and least <= number <= most and number > above):
+        sides = {"greater than": above, "at least": least, "at most": most}
+        rule = " and ".join(f"{words} {bound:g}" for words, bound in sides.items() if math.isfinite(bound))
+        nearest = min(max(number, least), most)
+        raise SpecificationError(
+            given or f"{name}={repr(value)[:150]} was given.",
+            f"It is a finite number {rule}.",
+            nearest=f"{name}={nearest:g}." if above < nearest != number else "",
+            name=name,
+            value=value,
+        )
+    return number
+
+
 def positive(name, value):
     """A positive finite float from a number."""
-    number = finite(name, value)
-    if number <= 0:
-        raise SpecificationError(f"{name} = {number:g} was given.", "It must be positive.", name=name, value=number)
-    return number
+    return within(name, value, above=0.0)
 
 
 def positives(name, values, do, fewest=1, most=np.inf):
@@ -312,29 +345,26 @@ def whole(name, value, least=0, most=math.inf):
     number = int(value) if is_number(value) or is_whole(value) else least - 1
     if not least <= number <= most or number != value:
         rule = f"It must be a whole number, at least {least}{f' and at most {most}' if most < math.inf else ''}."
-        said, nearest = f"{name}={value!r} was given."[:200], f"{name}={most}." if number > most else ""
-        raise SpecificationError(said, rule, nearest=nearest, name=name, value=value, least=least, most=most)
+        raise SpecificationError(
+            f"{name}={value!r} was given."[:200],
+            rule,
+            nearest=f"{name}={min(max(number, least), most)}." if is_number(value) else "",
+            name=name,
+            value=value,
+            least=least,
+            most=most,
+        )
     return number
 
 
 def tolerance(name, value, most):
-    """A positive number up to `most` that is not below what integrators can compute with."""
-    if positive_number(name, value, most) < LEAST_TOLERANCE:
-        given, rule = f"{name}={value:g} was given.", f"A tolerance is at least {LEAST_TOLERANCE:g}."
-        raise SpecificationError(given, rule, nearest=f"{name}={LEAST_TOLERANCE:g}.", **{name: value})
-    return float(value)
+    """A float up to `most` that is not below what integrators can compute with."""
+    return within(name, value, LEAST_TOLERANCE, most)
 
 
 def positive_number(name, value, most=np.inf):
-    """A positive number up to `most` as a float; text and truth values are none."""
-    if not (is_number(value) and 0 < value <= most):
-        raise SpecificationError(
-            f"{name}={value!r} was given.",
-            f"It is a positive number{f', at most {most:g}' if np.isfinite(most) else ''}.",
-            nearest=f"{name}={most:g}." if is_number(value) and value > most else "",
-            **{name: value},
-        )
-    return float(value)
+    """A positive float up to `most` from a number."""
+    return within(name, value, most=most, above=0.0)
 
 
 def whole_of(name, value, valid):
@@ -344,15 +374,10 @@ def whole_of(name, value, valid):
         raise SpecificationError(
             f"{name}={value!r} was given.",
             f"It is a whole number {span}.",
-            nearest=f"{name}={_nearest(valid, value)}." if is_number(value) else "",
+            nearest=f"{name}={min(valid, key=lambda number: abs(number - value))}." if is_number(value) else "",
             **{name: value},
         )
     return int(value)
-
-
-def _nearest(valid, value):
-    within = min(max(value, min(valid)), max(valid))
-    return min(valid, key=lambda number: abs(number - within))
 
 
 def whole_multiple(number, what, of):
@@ -394,14 +419,8 @@ def numbers_by_name(values, names, what, meaning, low=-np.inf, positive=False):
     """Finite numbers by name, none below `low`: each `what` ("actuator") has a `meaning` ("lag")."""
     numbers = {}
     for name, value in by_name(values, names, what, f"The {meaning}s").items():
-        numbers[name] = number = finite(name, value, meaning)
-        if number < low or (positive and number <= 0):
-            raise SpecificationError(
-                f"The {meaning} of {name!r} is {number:g}.",
-                f"A {meaning} must {'be positive' if positive else 'not be negative'}.",
-                name=name,
-                value=number,
-            )
+        number, given = finite(name, value, meaning), f"The {meaning} of {name!r} is {value!r}."
+        numbers[name] = within(name, number, low, above=0.0 if positive else -math.inf, given=given)
     return numbers
 
 

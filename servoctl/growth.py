@@ -25,7 +25,7 @@ from servoctl.methods.stability import stability_function
 from servoctl.model.switching import switching
 from servoctl.run import SAME_TIME, Run, require_run
 from servoctl.tolerances import TINY
-from servoctl.values import frozen
+from servoctl.values import evenly, frozen
 
 AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
 UNSTABLE = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
@@ -364,7 +364,7 @@ def linearised(model, run, count):
     At most `count` instants are spread over the samples, and those without a finite Jacobian are left out; f is the
     number of states less that of invariants.
     """
-    picked = np.unique(np.linspace(0, len(run.t) - 1, count).round().astype(int))
+    picked = evenly(len(run.t), count)
     tangents = _tangents(model, run, picked, run.t[picked], _states(model, run)[:, picked])
     return tangents.t, tangents.frozen
 
@@ -732,7 +732,7 @@ def _unstable_at_first(model, run):
 
 def _inconclusive(model, run):
     """No verdict, as no number of instants resolves the growth; with frozen eigenvalues at samples."""
-    samples = np.unique(np.linspace(0, len(run.t) - 1, FEWEST).round().astype(int))
+    samples = evenly(len(run.t), FEWEST)
     tangents = _tangents(model, run, samples, run.t[samples], _states(model, run)[:, samples])
     return InternalDynamics(tangents, "inconclusive", np.nan, np.nan)
 

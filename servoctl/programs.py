@@ -73,8 +73,7 @@ def follow_path(name, position, path, along):
             do="Write lambda s: sv.paths.line(s, start, end); for an expression of time, use follow_point.",
             name=name,
         )
-    (along,) = column(along, f"the parameter of {name!r}", 1)
-    return follow_point(name, position, path(along))
+    return follow_point(name, position, path(_scalar(along, f"the parameter of {name!r}")))
 
 
 def pose(name, frame, position, rotation):
@@ -221,10 +220,7 @@ def curvature(name, q, position, value):
     dict of str to SX
         One residual [1/m], without a value at rest: (x' y'' - y' x'')/|v|^3 - curvature.
     """
-    v, a = (_rate_of(name, q, position, k) for k in (1, 2))
-    _require_plane(name, v)
-    (value,) = column(value, f"the curvature of {name!r}", 1)
-    return {name: (v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5 - value}
+    return {name: _curvature(name, q, position) - _scalar(value, f"the curvature of {name!r}")}
 
 
 def curvature_rate(name, q, position, value):
@@ -244,10 +240,7 @@ def curvature_rate(name, q, position, value):
     dict of str to SX
         One residual [1/(m s)].
     """
-    v, a = (_rate_of(name, q, position, k) for k in (1, 2))
-    _require_plane(name, v)
-    (value,) = column(value, f"the rate of {name!r}", 1)
-    return {name: q.dt((v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5) - value}
+    return {name: q.dt(_curvature(name, q, position)) - _scalar(value, f"the rate of {name!r}")}
 
 
 def perpendicular_velocities(name, q, a, b):
@@ -286,8 +279,7 @@ def energy(name, mechanism, value):
         One residual [J].
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
-    (value,) = column(value, f"the energy of {name!r}", 1)
-    return {name: mechanism.energy - value}
+    return {name: mechanism.energy - _scalar(value, f"the energy of {name!r}")}
 
 
 def momentum(name, mechanism, coordinate, value):
@@ -311,8 +303,8 @@ def momentum(name, mechanism, coordinate, value):
     q = mechanism.q
     names = q.force_names
     named(coordinate, names, "coordinate" if q.plain else "quasi-velocity")
-    (value,) = column(value, f"the momentum of {name!r}", 1)
-    return {name: (mechanism.mass @ ca.vertcat(*q.gamma(1)))[names.index(coordinate)] - value}
+    momenta = mechanism.mass @ ca.vertcat(*q.gamma(1))
+    return {name: momenta[names.index(coordinate)] - _scalar(value, f"the momentum of {name!r}")}
 
 
 def formation(name, leader, followers, offsets):
@@ -393,7 +385,7 @@ def wish(mechanism, accelerations=None):
     wanted = dict.fromkeys(names, ca.SX(0))
     for name, value in mapping(accelerations, "The accelerations").items():
         named(name, names, "coordinate" if q.plain else "quasi-velocity")
-        (wanted[name],) = column(value, f"the acceleration of {name!r}", 1)
+        wanted[name] = _scalar(value, f"the acceleration of {name!r}")
     balance = ca.substitute(mechanism.balance, q.jet(2), ca.vertcat(*wanted.values()))
     forces = cse(inverse @ balance)
     return dict(zip(mechanism.actuators, forces.elements(), strict=True))
@@ -431,29 +423,24 @@ def posture(mechanism, at, rate):
     drawn = {name: -2.0 * rate * w for name, w in zip(q.names, q.gamma(1), strict=True)}
     for name, value in mapping(at, "The posture").items():
         named(name, q.names, "coordinate")
-        drawn[name] -= rate**2 * (q[name] - column(value, f"the wish of {name!r}", 1)[0])
+        drawn[name] -= rate**2 * (q[name] - _scalar(value, f"the wish of {name!r}"))
     return wish(mechanism, drawn)
 
 
 def _frame(frame):
     """Position and rotation of a frame, or of a pair."""
-    if isinstance(frame, Frame):
-        return frame.position, frame.rotation
-    if not isinstance(frame, tuple) or len(frame) != 2:
-        raise SpecificationError(
-            f"The frame is a {type(frame).__name__}.",
-            "It is a Frame, or a pair of a position and a rotation.",
-            do="Write robot.frame(link), or (position, rotation).",
-            type=type(frame).__name__,
-        )
-    return frame
+    if isinstance(frame, tuple) and len(frame) == 2:
+        return frame
+    frame = require_kind(Frame, "The frame", frame, "robot.frame(link), or write (position, rotation)")
+    return frame.position, frame.rotation
 
 
 def _vector(value, what):
-    entries = column(value, what)
-    if not 1 <= len(entries) <= 3:
-        raise SpecificationError(f"{what} has {len(entries)} entries.", "A point has one to three.", what=what)
-    return ca.vertcat(*entries)
+    return ca.vertcat(*column(value, what, 1, 2, 3))
+
+
+def _scalar(value, what):
+    return column(value, what, 1)[0]
 
 
 def _rate_of(name, q, position, k):
@@ -464,26 +451,17 @@ def _rate_of(name, q, position, k):
 
 def _norm(name, vector, value, what):
     """(|v|^2 - c^2)/(2 c)."""
-    (value,) = column(value, f"the value of {name!r}", 1)
-    if value.is_constant() and float(value) <= 0.0:
-        raise SpecificationError(
-            f"{name!r} programs {what} of {float(value):g}.",
-            "It is positive: at zero the gradient of a norm has no direction.",
-            do="Program the components instead.",
-            name=name,
-            value=float(value),
-        )
+    value = _scalar(value, f"the value of {name!r}")
+    if value.is_constant():  # at zero the gradient of a norm has no direction
+        positive(f"{what} of {name!r}", float(value))
     return (ca.dot(vector, vector) - value**2) / (2 * value)
 
 
-def _require_plane(name, vector):
-    if vector.numel() != 2:
-        raise SpecificationError(
-            f"The point of {name!r} has {vector.numel()} coordinates.",
-            "The curvature of a path has a sign in the plane alone.",
-            do="Give its two coordinates in the plane.",
-            name=name,
-        )
+def _curvature(name, q, position):
+    """The curvature of the path of a point, which has a sign in the plane alone."""
+    x, y = column(position, f"the position of {name!r}", 2)
+    v, a = (_rate_of(name, q, (x, y), k) for k in (1, 2))
+    return (v[0] * a[1] - v[1] * a[0]) / ca.dot(v, v) ** 1.5
 
 
 def _require_equal(name, a, b):

@@ -253,13 +253,7 @@ class Run(Sampled, Value):
         SpecificationError
             If the run does not hold the jets that the derivative needs.
         """
-        if self.model is None:
-            raise SpecificationError(
-                "The run was loaded from a file, without its model.",
-                "Groups of signals and their derivatives need the model.",
-                do="Use run[name] for what is stored, or sv.load(path, model).",
-                kind=kind,
-            )
+        self.require_model()
         parts = []
         for first, end, model in self.variants or ((0, len(self.t), self.model),):
             names, f = model.signals(kind, rate)
@@ -277,6 +271,16 @@ class Run(Sampled, Value):
                 )
             parts.append(f.grid(self.t[first:end], jets, model.parameters))
         return names, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+    def require_model(self):
+        """Refuse a run that was loaded without its model, where more than the stored samples is asked for."""
+        if self.model is None:
+            raise SpecificationError(
+                "The run was loaded from a file, without its model.",
+                "It has what is stored, run.names and run.jets; all else needs the model.",
+                do="Use sv.load(path, model).",
+                signals=list(self.names),
+            )
 
     def variant(self, i: int):
         """The variant of the model that holds at sample i."""
@@ -330,13 +334,7 @@ class Run(Sampled, Value):
                 t=t,
                 span=(low, high),
             )
-        if self.model is None:
-            raise SpecificationError(
-                "The run was loaded from a file, without its model.",
-                "Values between samples need the model.",
-                do="Use a column of run.jets.",
-                t=t,
-            )
+        self.require_model()
         i = int(np.argmin(np.abs(self.t - t)))
         if abs(self.t[i] - t) < 1e-13 * max(1.0, high - low) or len(self.t) == 1:
             return self.jets[:, i].copy()

@@ -110,6 +110,11 @@ def same(a, b):
     return bool(a == b) or (isinstance(a, float) and a != a and b != b)
 
 
+def evenly(n, most):
+    """Indices (k,) of at most so many of n entries, evenly spread from the first to the last."""
+    return np.unique(np.linspace(0, n - 1, most).round().astype(int))
+
+
 def read_only(array):
     """A view of an array that cannot be written."""
     view = array.view()

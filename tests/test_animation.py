@@ -135,16 +135,16 @@ def test_shapes_count_for_equality_and_survive_a_pickle(crane):
 @pytest.mark.parametrize(
     ("shapes", "facts"),
     [
-        (lambda q, p: {"rope": []}, {"name": "rope", "sizes": []}),
-        (lambda q, p: {"rope": [(q["x"], 0), (0, 0, 0)]}, {"sizes": [2, 3]}),
-        (lambda q, p: {"rope": [q["x"]]}, {"sizes": [1]}),
-        (lambda q, p: {"rope": [(q["x"], 0)], "far": [(0, 0, 0)]}, {"sizes": {"rope": 2, "far": 3}}),
-        (lambda q, p: {"rope": [(q.d(1)[0], 0)]}, {"name": "rope", "order": 1, "limit": 0}),
+        (lambda q, p: {"rope": []}, {"name": "rope"}),
+        (lambda q, p: {"rope": [(q["x"], 0), (0, 0, 0)]}, {"what": "The shape 'rope', point 2,", "entries": 3, "sizes": (2,)}),
+        (lambda q, p: {"rope": [q["x"]]}, {"entries": 1, "sizes": (2, 3)}),
+        (lambda q, p: {"rope": [(q["x"], 0)], "far": [(0, 0, 0)]}, {"what": "The shape 'far', point 1,", "sizes": (2,)}),
+        (lambda q, p: {"rope": [(q.d(1)[0], 0)]}, {"what": "The shape 'rope'", "order": 1, "limit": 0}),
         (lambda q, p: {"rope": [(ca.SX.sym("y"), 0)]}, {"name": "y"}),
         (lambda q, p: {"rope": [(np.nan, 0)]}, {}),
         (lambda q, p: [(0, 0)], {}),
-        (lambda q, p: {"rope": "xy"}, {"name": "rope", "type": "str"}),
-        (lambda q, p: {"rope": ca.SX.zeros(2, 3)}, {"name": "rope", "type": "SX"}),  # columns or rows?
+        (lambda q, p: {"rope": "xy"}, {"name": "rope"}),
+        (lambda q, p: {"rope": ca.SX.zeros(2, 3)}, {"name": "rope"}),  # columns or rows?
     ],
 )
 def test_what_is_no_shape_is_refused(shapes, facts):

@@ -3,10 +3,12 @@
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refused
 
 import servoctl as sv
 from servoctl import checks
 from servoctl.units import as_units
+from servoctl.values import evenly
 
 
 def error_of(check, *given, **options):
@@ -95,3 +97,25 @@ def test_progress_is_a_switch_or_a_function_of_the_time(wheel, progress):
 def test_bars_work_without_a_terminal(monkeypatch):
     monkeypatch.setattr("sys.stderr", None)
     assert len(sv.sweep(lambda a: {"b": a}, [{"a": 1.0}])) == 1
+
+
+@pytest.mark.parametrize("given", [0.0, -1.0, 3.5, np.nan, np.inf, "1", True, None, [1.0], ca.SX.sym("a")])
+def test_a_number_out_of_range_is_refused_with_the_nearest_one(given):
+    with refused(sv.errors.SpecificationError, "fps=", name="fps"):
+        checks.within("fps", given, most=3.0, above=0.0)
+
+
+def test_a_range_has_its_ends():
+    assert [checks.within("fps", given, 1, 3) for given in (1, np.float32(3.0), np.int8(2))] == [1.0, 3.0, 2.0]
+    with refused(sv.errors.SpecificationError, "fps=3", value=4.0):
+        checks.within("fps", 4.0, 1, 3)
+
+
+def test_options_that_do_nothing_are_named():
+    checks.without_effect([], "here")
+    with refused(sv.errors.SpecificationError, "rate, delay", options=["rate", "delay"]):
+        checks.without_effect(["rate", "delay"], "for a Model")
+
+
+def test_indices_are_spread_from_the_first_to_the_last():
+    assert evenly(5, 3).tolist() == [0, 2, 4] and evenly(2, 9).tolist() == [0, 1] and evenly(1, 4).tolist() == [0]

@@ -60,7 +60,7 @@ def test_laws_without_expressions_name_themselves_and_what_can_be_exported(plan,
     with refused(SpecificationError, "Model", "Law", type="dict"):
         sv.export_c({}, tmp_path)
     for folder in (None, 3):
-        with refused(SpecificationError, folder=folder):
+        with refused(SpecificationError, path=folder):
             sv.export_c(inside, folder)
     with refused(SpecificationError, "start", type="int"):
         sv.export_c(plan.model, tmp_path, start=3)

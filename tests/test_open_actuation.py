@@ -588,7 +588,7 @@ def test_wishes_that_are_no_actuation_are_refused(wish):
 
 def test_wishes_of_accelerations_are_refused():
     mechanism, program = ship(3, ("X", "Y"))
-    with refused(SpecificationError, name="fore", order=2):
+    with refused(SpecificationError, what="The wish of 'fore'", order=2):
         sv.derive(mechanism, sv.Program(program.residuals, toward={"fore": mechanism.q.d(2)[0]}))
 
 
@@ -596,7 +596,7 @@ def test_wishes_where_nothing_is_open_are_refused():
     mechanism, program = ship(3, ("X", "Y", "heading"))
     with refused(SpecificationError, wishes=["fore"]):
         sv.derive(mechanism, sv.Program(program.residuals, toward={"fore": 1.0}))
-    with refused(SpecificationError, by="ideal"):
+    with refused(SpecificationError, "by='ideal'", options=["toward"]):
         sv.Program(program.residuals, by="ideal", toward={"fore": 1.0})
 
 

@@ -278,7 +278,7 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
         (lambda q: sv.rotations.turn(q["x"], (0, 0, 1), np.zeros((3, 3))), "no rotation"),
         (lambda q: sv.rotations.spline(q.t, [], []), "rotation"),
         (lambda q: sv.programs.follow_point("p", (q["x"], q["y"]), (1,)), "2 entries with 1"),
-        (lambda q: sv.programs.curvature("p", q, (q["x"], q["y"], 0), 1.0), "3 coordinates"),
+        (lambda q: sv.programs.curvature("p", q, (q["x"], q["y"], 0), 1.0), "3 entries"),
         (lambda q: sv.programs.follow_path("p", (q["x"],), q["y"], q.t), "follow_point"),
         (lambda q: sv.programs.pose("p", q["x"], (0, 0, 0), np.eye(3)), "Frame"),
         (lambda q: sv.programs.orientation("p", np.eye(2), np.eye(3)), "(2, 2)"),

@@ -253,7 +253,7 @@ REFUSED = {
     "an axis of zero": (bar(inside='<axis xyz="0 0 0"/>'), "0 0 0", {}),
     "a number": (bar(inside='<axis xyz="0 one 0"/>'), "0 one 0", {"value": "0 one 0"}),
     "NaN": (bar(inside='<dynamics damping="nan"/>'), "nan", {}),
-    "a negative mass": (bar(INERTIAL.replace('"2"/>', '"-2"/>')), "-2", {"link": "bar"}),
+    "a negative mass": (bar(INERTIAL.replace('"2"/>', '"-2"/>')), "-2", {"name": "the mass of link 'bar'", "value": -2.0}),
     "no mass": (bar('<inertial><inertia ixx="1"/></inertial>'), "bar", {}),
     "the triangle rule": (bar(INERTIAL.replace("2.5", "3.5")), "3.5", {"link": "bar"}),
     "a negative moment": (bar(INERTIAL.replace('ixx="1"', 'ixx="-1"')), "-1", {"link": "bar"}),

@@ -14,12 +14,13 @@ import os
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import named
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.interpreted import BLOCK, Interpreter, restored, restored_grid, weighted
 from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library, builtin
 from servoctl.codegen.tables import BOUND
-from servoctl.errors import SpecificationError, unknown
+from servoctl.errors import SpecificationError
 from servoctl.jets.branches import contains
 
 GRID_POINTS = 2_500  # 20 longer grids take CasADi as long as writing and loading a library, 200 as compiling it
@@ -55,8 +56,7 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
             name=name,
         )
     for loop in loops:
-        if loop not in LOOPS:
-            raise unknown(loop, LOOPS, "loop")
+        named(loop, LOOPS, "loop")
         needed = _OUTPUTS_PER_STATE.get(loop, 0) * f.numel_in(1)
         if f.numel_out(0) < needed:
             raise SpecificationError(

@@ -11,7 +11,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import named, positive
+from servoctl.checks import as_path, named, positive, require_kind, without_effect
 from servoctl.codegen.function import Compiled
 from servoctl.control.law import Law
 from servoctl.errors import SpecificationError
@@ -102,18 +102,14 @@ def export_c(
     law = hasattr(source, "schedule") and isinstance(getattr(getattr(step, "law", None), "step", step), Compiled)
     if not law and not hasattr(source, "reduction"):
         raise _without_expressions(source)
-    _require_start(law, start)
+    without_effect(["start"] if law and start is not None else [], "for a law, which starts with its controller state")
+    without_effect(["thinned"] if not law and thinned is not None else [], "for a model, which has no schedule")
+    start = None if start is None else require_kind(State, "start", start, "model.start(...)")
     named(real, ("double", "float"), "type of numbers")
-    thinned = None if thinned is None else _thinning(law, thinned)
+    thinned = None if thinned is None else positive("thinned", thinned)
     name = ("law" if law else "model") if name is None else name
     _require_name(name)
-    if not isinstance(folder, (str, os.PathLike)):
-        raise SpecificationError(
-            f"folder={folder!r}."[:200],
-            "The files are written into a folder.",
-            do="Pass its path, a str or a Path.",
-            folder=folder,
-        )
+    folder = as_path(folder, "The folder")
     found = None if law or source.flat else verdict(source, start)
     if found is not None and found.dynamics in (HYPERBOLIC_ZEROS, GROWS):
         warnings.warn(
@@ -128,23 +124,6 @@ def export_c(
         _require_counted(contents)
         contents.sizes.update({key: value for key, value in IN_FLOATS.items() if key in contents.sizes})
     return write(folder, name, contents, real)
-
-
-def _require_start(law, start):
-    if law and start is not None:
-        raise SpecificationError(
-            "start= is set in the export of a law.",
-            "A law starts with its controller state.",
-            do="Leave start= out.",
-            start=start,
-        )
-    if start is not None and not isinstance(start, State):
-        raise SpecificationError(
-            f"start= is a {type(start).__name__}.",
-            "The start of a model is a consistent State.",
-            do="Pass model.start(...).",
-            type=type(start).__name__,
-        )
 
 
 def _require_name(name):
@@ -279,17 +258,6 @@ def _integrated(model, x, z, p, u):
     ]
     sizes = {"N": model.n, "NX": size, "NJ": len(z.names), "NU": len(u.names)}
     return {"rates": rates}, routines, ("answer.c", "integrated.c"), sizes
-
-
-def _thinning(law, thinned):
-    """The bound of `thinned`, checked."""
-    if not law:
-        raise SpecificationError(
-            "thinned= is set in the export of a model.",
-            "Rows are left out of the schedule of a law.",
-            do="Leave thinned= out.",
-        )
-    return positive("thinned", thinned)
 
 
 def _of_law(law, thinned):

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from servoctl.archive import writing
-from servoctl.checks import as_path, finite, require_kind, text, texts, whole
-from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.checks import as_path, named, require_kind, text, texts, whole, within
+from servoctl.errors import ServoError, SpecificationError
 from servoctl.figures import style
 from servoctl.figures.names import planes_of
 from servoctl.figures.page_motion import moving_drawing
@@ -212,17 +212,11 @@ def animate(run, fps=25, trail=None):
     --------
     >>> sv.figures.animate(run).save("crane.gif")
     """
-    if not 1 <= finite("fps", fps, "number of frames per second") <= 50:
-        raise SpecificationError(
-            f"fps = {fps:g} was given.",
-            "Common viewers show from 1 to 50 frames per second.",
-            nearest=f"fps = {min(max(fps, 1), 50)}.",
-            fps=fps,
-        )
+    fps = within("fps", fps, 1, 50)  # which common viewers show
     _require_drawable(run)
     span = float(abs(run.t[-1] - run.t[0]))
     pace = max(min(1.0, span / SLOWED), span * fps / (MOST_FRAMES - 1)) or 1.0
-    return _pictured(run, _spread(run, math.floor(span * fps / pace + 1e-9) + 1), trail, float(fps), pace)
+    return _pictured(run, _spread(run, math.floor(span * fps / pace + 1e-9) + 1), trail, fps, pace)
 
 
 def stroboscope(run, poses=9, trail=None, ax=None, title=""):
@@ -328,11 +322,15 @@ def _side_by_side(picture, each, ax, title):
 
 def shows_mechanism(run) -> bool:
     """Whether `animate` and `stroboscope` can draw a run: it has samples, and its mechanism shapes or positions."""
-    model = run.plant if hasattr(run, "commands") else run.model
-    if model is None or not len(run.t):
-        return False
-    mechanism = model.mechanism if hasattr(run, "commands") else model.reduction.mechanism
-    return bool(mechanism.shapes or _positions(mechanism))
+    mechanism, _ = _mechanism(run)
+    return mechanism is not None and len(run.t) > 0 and bool(mechanism.shapes or _positions(mechanism))
+
+
+def _mechanism(run):
+    """The mechanism of a run or a closed loop, and the numbers of its parameters; None of a run without its model."""
+    if hasattr(run, "commands"):
+        return run.plant.mechanism, run.plant.parameters
+    return (None, ()) if run.model is None else (run.model.reduction.mechanism, run.model.parameters)
 
 
 def _positions(mechanism):
@@ -345,13 +343,7 @@ def _require_drawable(run):
     """Refuse what is no motion with a mechanism and finite samples."""
     if not hasattr(run, "commands"):
         require_kind(Run, "run", run, "sv.simulate(...) or sv.close(...)")
-        if run.model is None:
-            raise SpecificationError(
-                "The run was loaded from a file, without its model.",
-                "The mechanism is drawn by the model.",
-                do="Use sv.load(path, model).",
-                signals=list(run.names),
-            )
+        run.require_model()
     if not len(run.t):
         raise SpecificationError("The motion has no samples.", do="See run.message.", samples=0)
 
@@ -362,16 +354,11 @@ def _spread(run, count):
 
 def _postures(run, t):
     """The mechanism of a run, its parameters, and its coordinates (nq, N) at some instants."""
-    if hasattr(run, "commands"):
-        mechanism, p = run.plant.mechanism, run.plant.parameters
-        q = np.array([np.interp(t, run.t, run[name]) for name in mechanism.q.names])
+    mechanism, p = _mechanism(run)
+    if hasattr(run, "commands") or len(run.t) >= PATH_POINTS:  # straight between samples: that cannot be seen
+        q = np.array([np.interp(t, *_ascending(run, name)) for name in mechanism.q.names])
     else:
-        mechanism, p = run.model.reduction.mechanism, run.model.parameters
-        names = run.jet_names[: run.model.nq]
-        if len(run.t) >= PATH_POINTS:  # straight between samples: the difference cannot be seen
-            q = np.array([np.interp(t, *_ascending(run, name)) for name in names])
-        else:
-            q = np.array([run.at(instant)[: len(names)] for instant in t]).T
+        q = np.array([run.at(instant)[: mechanism.q.nq] for instant in t]).T
     return mechanism, np.asarray(p)[: len(mechanism.parameters.names)], q
 
 
@@ -380,8 +367,7 @@ def _pictured(run, t, trail, fps, pace):
     shapes = _shapes(run, t)
     trail = list(shapes)[-1:] if trail is None else texts(trail, "The trails")
     for name in trail:
-        if name not in shapes:
-            raise unknown(name, tuple(shapes), "shape")
+        named(name, shapes, "shape")
     plan, closed = getattr(run, "plan", None), hasattr(run, "commands")
     whole_plan = plan if closed and getattr(plan, "model", None) is not None else None if closed else run
     below = {} if whole_plan is None else _shapes(whole_plan, _spread(whole_plan, PATH_POINTS))

@@ -71,9 +71,8 @@ def _histogram(ax, values, label):
     values = values[np.isfinite(values)]
     if len(values) < DRAWN_EACH:
         ax.plot(np.sort(values), np.arange(1, len(values) + 1), "o", color=style.COLOURS[0])
-        ax.set(xlabel=label, ylabel="cases at most as large", ylim=(0, len(values) + 1))
+        style.finish(ax, xlabel=label, ylabel="cases at most as large", ylim=(0, len(values) + 1))
         ax.yaxis.get_major_locator().set_params(integer=True)
-        ax.grid(alpha=0.3)
         return
     ax.hist(values, bins="auto" if len(values) < 5000 else 60, color=style.COLOURS[0], alpha=0.55)
     for share, line in SHARES.items():
@@ -88,8 +87,7 @@ def _scatter(ax, x, values, failed):
     if failed.any():
         at_the_bottom = {"transform": ax.get_xaxis_transform(), "label": f"{failed.sum()} without result"}
         ax.plot(x[failed], np.full(failed.sum(), 0.03), "x", color=style.COLOURS[1], **at_the_bottom)
-        ax.legend(fontsize=9)
-    ax.grid(alpha=0.3)
+    style.finish(ax, legend={} if failed.any() else None)
 
 
 def _varies(study, name):

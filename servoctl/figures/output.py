@@ -26,8 +26,7 @@ def draw_output(result):
         ax.axvline(c.value, color="black", lw=1, ls=":", label="flat" if c.flat else "relative degree lost")
     ax.axvline(result.own, color=style.COLOURS[3], lw=1, ls="--", label="the model's own value")
     ax.axhline(0.0, color="black", lw=0.8)
-    ax.set(xlim=(result.values[0], result.values[-1]), ylim=(-limit, limit), xlabel=result.parameter)
-    ax.set_ylabel("real part [1/s]")
-    ax.set_title("Internal dynamics at the equilibrium", fontsize=11)
-    ax.legend(fontsize=9)
+    ax.set(xlim=(result.values[0], result.values[-1]), ylim=(-limit, limit))
+    labels = {"xlabel": result.parameter, "ylabel": "real part [1/s]"}
+    style.finish(ax, "Internal dynamics at the equilibrium", legend={}, **labels)
     return figure

@@ -39,17 +39,13 @@ def _effort(ax, report, name):
     ax.plot(effort.peak_at, effort.peak, "o", color=style.COLOURS[1], label=f"peak {effort.peak:.5g}")
     if effort.limit is not None:
         ax.axhline(effort.limit, color=style.COLOURS[6], linestyle="--", label=f"nearest limit {effort.limit:g}")
-    ax.set(xlabel="t [s]", ylabel=name)
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=9)
+    style.finish(ax, xlabel="t [s]", ylabel=name, legend={})
 
 
 def _growth(ax, report, _):
     t, growth = report.basis.internal.until
     ax.semilogy(t, growth, color=style.COLOURS[0])
-    ax.set(xlabel="t [s]", ylabel="growth of errors")
-    ax.set_title("largest growth of an error up to t", fontsize=10)
-    ax.grid(alpha=0.3)
+    style.finish(ax, "largest growth of an error up to t", xlabel="t [s]", ylabel="growth of errors")
 
 
 def _eigenvalues(ax, report, _):
@@ -58,10 +54,9 @@ def _eigenvalues(ax, report, _):
         ax.plot(end.eigenvalues.real, end.eigenvalues.imag, mark, color=colour, label=label)
     ax.axvline(0.0, color=style.COLOURS[6], linewidth=1.0)
     reach = 1.2 * max(max(np.abs(end.eigenvalues).max(initial=0.0) for end in report.basis.rest.values()), 1e-300)
-    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="real part [1/s]", ylabel="imaginary part [1/s]")
-    ax.set_title("eigenvalues of the internal dynamics at rest", fontsize=10)
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=9)
+    limits = {"xlim": (-reach, reach), "ylim": (-reach, reach)}
+    labels = {"xlabel": "real part [1/s]", "ylabel": "imaginary part [1/s]"}
+    style.finish(ax, "eigenvalues of the internal dynamics at rest", legend={}, **limits, **labels)
 
 
 def _angles(ax, report, _):
@@ -69,10 +64,9 @@ def _angles(ax, report, _):
     ax.bar(range(1, len(degrees) + 1), degrees, color=style.COLOURS[2], width=0.6)
     for place, value in enumerate(degrees, 1):
         ax.annotate(f"{round(value, 2):g}°", (place, value), ha="center", va="bottom")
-    ax.set(xlabel="principal angle", ylabel="[°]", ylim=(0, 105), yticks=(0, 30, 60, 90))
-    ax.set_xticks(range(1, len(degrees) + 1))
-    ax.set_title("angles between actuators and normals of the program", fontsize=10)
-    ax.grid(alpha=0.3, axis="y")
+    ax.set(ylim=(0, 105), yticks=(0, 30, 60, 90), xticks=range(1, len(degrees) + 1))
+    title = "angles between actuators and normals of the program"
+    style.finish(ax, title, xlabel="principal angle", ylabel="[°]")
 
 
 def _orders(ax, report, _):
@@ -80,6 +74,5 @@ def _orders(ax, report, _):
     places = np.arange(len(facts))
     for shift, key, colour in ((-0.2, "order", 0), (0.2, "raised", 1)):
         ax.bar(places + shift, [fact[key] for fact in facts], 0.4, color=style.COLOURS[colour], label=key)
-    ax.set(xticks=places, xticklabels=list(report.residuals), ylabel="derivatives")
-    ax.set_title("order of each residual, and how often it is raised", fontsize=10)
-    ax.legend(fontsize=9)
+    title = "order of each residual, and how often it is raised"
+    style.finish(ax, title, xticks=places, xticklabels=list(report.residuals), ylabel="derivatives", legend={})

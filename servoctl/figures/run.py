@@ -16,12 +16,12 @@ from servoctl.figures.style import (
     COLOURS,
     PANEL,
     STYLES,
-    as_axes,
+    as_panels,
     as_single_axes,
+    finish,
     high,
     logarithmic,
     look,
-    panels,
     write_png,
 )
 from servoctl.run import Run
@@ -76,14 +76,12 @@ def path(run, x=None, y=None, ax=None, units=None):
     ax.plot(across[0], up[0], "o", color=COLOURS[0], markerfacecolor="white", label=f"start, t = {run.t[0]:.4g} s")
     word = _ending(run)
     ax.plot(across[-1], up[-1], "s" if run.success else "X", color=COLOURS[1], label=f"{word}, t = {run.t[-1]:.4g} s")
-    ax.set(xlabel=label_of([x], units), ylabel=label_of([y], units))
+    finish(ax, xlabel=label_of([x], units), ylabel=label_of([y], units), legend={})
     spans = sorted(float(np.ptp(v[np.isfinite(v)])) if np.isfinite(v).any() else 0.0 for v in (across, up))
     if unit_of(x, units) and unit_of(x, units) == unit_of(y, units) and spans[1] <= 5 * spans[0]:
         ax.set_aspect("equal", adjustable="datalim")
     if _height(run, [x, y])[1] < 0:
         ax.invert_yaxis()
-    ax.grid(alpha=0.3)
-    ax.legend()
     return ax
 
 
@@ -207,8 +205,7 @@ def residuals(run, ax=None):
             top = max(top, worst[np.isfinite(worst)].max(initial=LEAST))
             ax.plot(t, worst, STYLES[j % len(STYLES)], color=COLOURS[i % len(COLOURS)], linewidth=1.0 if j else 1.8)
     logarithmic(ax)
-    ax.set(xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(LEAST / 2, max(10 * top, 1e-12)))
-    ax.grid(alpha=0.3)
+    finish(ax, xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(LEAST / 2, max(10 * top, 1e-12)))
     _instants(run, [ax])
     _end(run, [ax])
     _keys(ax, list(run.residual), levels)
@@ -257,26 +254,12 @@ def save_figures(run, folder, units=None, title=""):
     return files
 
 
-def heights_of(groups):
-    """Heights of panels with the legends of groups of names: a single one is higher."""
-    return [max(high(len(group)), 2 * PANEL / len(groups)) for group in groups]
-
-
 def over_time(run, groups, ax, units, extrema=False):
     """Draw groups of signals: one panel for each, or all in `ax` if that is a single Axes."""
-    given = as_axes(ax)
-    single = len(given) == 1 and given[0] is ax
+    single = hasattr(ax, "plot")
     if single:
         groups = [[name for group in groups for name in group]]
-    axes = np.ravel(panels(heights_of(groups)) if ax is None else given)
-    if len(axes) != len(groups):
-        raise SpecificationError(
-            f"{len(axes)} Axes were given.",
-            f"There are {len(groups)} panels: {'; '.join(', '.join(group) for group in groups)}.",
-            do="Give as many Axes as panels, or one for all.",
-            axes=len(axes),
-            panels=len(groups),
-        )
+    axes = as_panels(ax, [max(high(len(group)), 2 * PANEL / len(groups)) for group in groups])  # a single one is higher
     largest = _largest(run, [name for group in groups for name in group], units)
     for panel, group in zip(axes, groups, strict=True):
         mixed = len({unit_of(name, units) for name in group}) > 1
@@ -284,8 +267,7 @@ def over_time(run, groups, ax, units, extrema=False):
             panel.plot(run.t, run[name], label=label_of([name], units if mixed else {}), **look(i))
         of_unit = max(largest[unit_of(name, units)] for name in group)
         _frame(panel, run, group, max(largest.values()) if of_unit < VISIBLE * max(largest.values()) else of_unit)
-        panel.set_ylabel(label_of(group, units))
-        panel.grid(alpha=0.3)
+        finish(panel, ylabel=label_of(group, units))
         if len(group) > 1:
             panel.legend(**BESIDE)
         if extrema:

@@ -5,6 +5,7 @@ import numpy as np
 from servoctl.figures import style
 
 SHADED_STEPS, SHADED_POLES, LINE = 120, 81, 3  # points of the shaded map; lines have every third pole
+POLES = "poles of the error dynamics, 1/T [1/s]"
 LEVELS = (0.0, 0.5, 0.8, 0.9, 0.95, 1.0, 1.05, 1.2, 1.5, 2.0)  # levels of the radius, fine near the bound of stability
 
 
@@ -24,10 +25,7 @@ def _largest_steps(stability, ax, poles, methods):
         steps = np.array([stability.largest_step(method, 1.0 / pole) for pole in poles])
         name = f"Taylor, order {stability.order}" if method == "Taylor" else method
         ax.loglog(poles, np.where(steps > 0, steps, np.nan), color=colour, label=name)
-    ax.set(xlabel="poles of the error dynamics, 1/T [1/s]", ylabel="step h [s]")
-    ax.set_title("Largest stable step", fontsize=11)
-    ax.grid(alpha=0.3)
-    ax.legend(fontsize=9)
+    style.finish(ax, "Largest stable step", xlabel=POLES, ylabel="step h [s]", legend={})
 
 
 def _radius(stability, ax, method, poles, limits):
@@ -40,10 +38,10 @@ def _radius(stability, ax, method, poles, limits):
     fewer = _fewer(poles)
     boundary = [stability.largest_step(method, 1.0 / pole) for pole in fewer]
     ax.plot(fewer, boundary, color="black", label="largest stable step")
-    ax.set(xscale="log", yscale="log", ylim=limits, xlabel="poles of the error dynamics, 1/T [1/s]")
-    ax.set_title(f"{method}: spectral radius of a step, at worst along the plan", fontsize=11)
+    ax.set(xscale="log", yscale="log", ylim=limits)
+    title = f"{method}: spectral radius of a step, at worst along the plan"
+    style.finish(ax, title, xlabel=POLES, legend={"loc": "lower left"})
     ax.figure.colorbar(shade, ax=ax, label="factor per step (2: two or more)", ticks=LEVELS)
-    ax.legend(fontsize=9, loc="lower left")
 
 
 def _fewer(poles):

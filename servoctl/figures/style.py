@@ -6,6 +6,7 @@ import re
 import numpy as np
 
 from servoctl.checks import as_list, require_kind
+from servoctl.errors import SpecificationError
 from servoctl.units import with_unit
 
 SOURCE = "matplotlib.pyplot.subplots()"
@@ -81,17 +82,37 @@ def panels(heights, **options):
     return axes
 
 
+def finish(ax, title="", legend=None, **labels):
+    """Labels and limits of a panel, its title, a faint grid, and its legend where that has a place: {} for the best."""
+    ax.set(**labels)
+    ax.grid(alpha=0.3)
+    ax.set_title(title, fontsize=10)
+    if legend is not None:
+        ax.legend(fontsize=9, **legend)
+
+
 def high(entries):
     """Height of a panel with so many entries of its legend [inches]."""
     return max(PANEL, ENTRY * entries)
 
 
-def as_axes(ax):
-    """An (n,) array of Axes from one or a sequence of them; (0,) from None."""
+def as_panels(ax, heights):
+    """An array of Axes from one or a sequence of them, or in a new figure: one for each of the heights [inches]."""
     from matplotlib.axes import Axes
 
-    several = [] if ax is None else as_list(ax.ravel() if isinstance(ax, np.ndarray) else ax)
-    return [require_kind(Axes, "ax", one, SOURCE) for one in ([ax] if several is None else several)]
+    if ax is None:
+        return panels(heights)
+    several = as_list(ax.ravel() if isinstance(ax, np.ndarray) else ax)
+    axes = [require_kind(Axes, "ax", one, SOURCE) for one in ([ax] if several is None else several)]
+    if len(axes) != len(heights):
+        raise SpecificationError(
+            f"{len(axes)} Axes were given.",
+            f"There are {len(heights)} panels.",
+            do="Give as many Axes as panels.",
+            axes=len(axes),
+            panels=len(heights),
+        )
+    return np.array(axes)
 
 
 def as_single_axes(ax, height, **options):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from servoctl.checks import array_of, as_list, as_numbers, finite, named, positive
+from servoctl.checks import array_of, as_list, as_numbers, finite, named, positive, require_kind, without_effect
 from servoctl.codegen.jacobians import differentiable, jacobian
 from servoctl.control.law import Law, ordered
 from servoctl.control.reference import resampled
@@ -12,12 +12,12 @@ from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.errors import SpecificationError
 from servoctl.interop.names import (
+    SYSTEMS,
     connected,
     disturbable_of,
     disturbed_names,
     output_names,
     signal_names,
-    stranger,
     system_name,
 )
 from servoctl.model.model import Model
@@ -61,14 +61,12 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     NameUnknown
         For a disturbance of what is no generalised force or parameter.
     """
-    _require_applicable(
-        thing,
-        x=x is not None,
-        u=u is not None,
-        controller_state=controller_state is not None,
-        rate=rate is not None,
-        disturbed=as_list(disturbed) != [],
-    )
+    require_kind((Model, Plant, Law, Closed), "thing", thing, SYSTEMS)
+    given = {"x": x, "u": u, "controller_state": controller_state, "rate": rate}
+    given["disturbed"] = as_list(disturbed) or None
+    valid = next(options for kind, options in OPTIONS.items() if isinstance(thing, kind))
+    idle = [name for name, value in given.items() if value is not None and name not in valid]
+    without_effect(idle, f"for a {type(thing).__name__}")
     t = finite("t", t, "time")
     if isinstance(thing, Plant):
         return _linear_plant(thing, t, thing.state(x), u, rate, disturbed, system_name(name, "plant"))
@@ -76,24 +74,8 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
         return _linear_law(thing, t, x, controller_state, system_name(name, "law"))
     if isinstance(thing, Closed):
         return _linear_closed(thing, t, system_name(name, "loop"))
-    if isinstance(thing, Model):
-        state = ordered(x if isinstance(x, dict) else getattr(x, "values", x), thing.state_names, "state")
-        return _linear_model(thing, t, state, system_name(name, "model"))
-    raise stranger(thing)
-
-
-def _require_applicable(thing, **used):
-    """Refuse options that do not apply to the thing."""
-    for kind, valid in OPTIONS.items():
-        surplus = [option for option, is_used in used.items() if is_used and option not in valid]
-        if isinstance(thing, kind) and surplus:
-            raise SpecificationError(
-                f"{', '.join(surplus)} was given for a {kind.__name__}.",
-                f"The point and options of a {kind.__name__} are {', '.join(('t', *valid))}.",
-                do="Leave it out.",
-                names=surplus,
-                valid=valid,
-            )
+    state = ordered(x if isinstance(x, dict) else getattr(x, "values", x), thing.state_names, "state")
+    return _linear_model(thing, t, state, system_name(name, "model"))
 
 
 def along(thing, run, times=None, **options):
@@ -120,8 +102,8 @@ def along(thing, run, times=None, **options):
     SpecificationError
         For times outside the run, and as `linearise`.
     """
-    if not isinstance(run, (Run, Closed)):
-        raise stranger(run, "Systems are linearised along a Run or a Closed.")
+    require_kind((Model, Plant, Law), "thing", thing, SYSTEMS)
+    require_kind((Run, Closed), "run", run, "sv.simulate(...) or sv.close(...)")
     times = run.t if times is None else array_of("times", np.atleast_1d(as_numbers(times)), None)
     if isinstance(run, Closed):
         picked = [int(np.argmin(np.abs(run.t - t))) for t in times]
@@ -140,10 +122,8 @@ def along(thing, run, times=None, **options):
             yield linearise(thing, t, _at(values, thing.state_names, k), u, **options)
         elif isinstance(thing, Law):
             yield linearise(thing, t, _at(values, thing.measures, k), **options)
-        elif isinstance(thing, Model):
-            yield linearise(thing, t, list(_at(values, thing.state_names, k).values()), **options)
         else:
-            raise stranger(thing)
+            yield linearise(thing, t, list(_at(values, thing.state_names, k).values()), **options)
 
 
 def _at(values, names, k):
@@ -193,8 +173,7 @@ def loop_gain(plant, law, at):
     import control
 
     for system in (plant, law):
-        if not isinstance(system, control.StateSpace):
-            raise stranger(system, "A loop gain is that of two linear systems, from interop.linearise.")
+        require_kind(control.StateSpace, "system", system, "interop.linearise(...)")
     if plant.dt != law.dt:
         raise SpecificationError(
             f"The plant has dt = {plant.dt:g} s, the law {law.dt:g} s.",
@@ -275,15 +254,7 @@ def _linear_law(law, t, x, controller_state, name):
         at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}
     y, m, n_z = ordered(x, law.measures, "measurement", exactly=False), len(law.inputs), len(law.state)
-    z = as_numbers(law.state if controller_state is None else controller_state)
-    if z.shape != (n_z,):
-        raise SpecificationError(
-            f"The controller state has the shape {z.shape}.",
-            f"That of the law {law.name!r} has {n_z} numbers.",
-            do=f"Pass {', '.join(law.state_names) or 'none'}.",
-            shape=z.shape,
-            size=n_z,
-        )
+    z = array_of("controller_state", law.state if controller_state is None else controller_state, n_z)
     J = jacobian(law.step, "x", t, np.append(y, z), law.schedule_at(t))
     n_y = len(y)
     A, B, C, D = J[m : m + n_z, n_y:], J[m : m + n_z, :n_y], J[:m, n_y:], J[:m, :n_y]
@@ -341,14 +312,6 @@ def _linear_model(model, t, x, name):
     import control
 
     n, n_x, p = model.n, len(model.state_names), model.parameters
-    if x.shape != (n_x,):
-        raise SpecificationError(
-            f"The state has the shape {x.shape}.",
-            f"It has {n_x} numbers: {', '.join(model.state_names)}.",
-            do="Pass them in this order, as model.start(...) does.",
-            shape=x.shape,
-            names=model.state_names,
-        )
     ode = model.function("ode")
     A = jacobian(ode, "x", t, x, p)[:n_x]
     z, to_jets = np.append(x, ode(t, x, p)[n_x - n : n_x]), np.vstack([np.eye(n_x), A[-n:]])

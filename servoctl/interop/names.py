@@ -3,7 +3,7 @@
 from servoctl.checks import text, texts
 from servoctl.errors import SpecificationError
 
-RULE = "A system of python-control is made of a Model, a Plant, a Law or the Closed of sv.close."
+SYSTEMS = "sv.derive (run.model of a plan), sv.plant, a law such as sv.lqr, or sv.close"
 
 
 def output_names(plant):
@@ -53,10 +53,3 @@ def connected(system, law_system, closed, name):
         outlist=[*(f"plant.{y}" for y in outputs), *(f"law.{a}" for a in law.inputs)],
         outputs=[*outputs, *(f"command {a}" for a in law.inputs)],
     )
-
-
-def stranger(thing, rule=RULE):
-    """The error for an object of an unknown type."""
-    nearest = "run.model, of a plan." if hasattr(thing, "jets") else ""
-    kind = type(thing).__name__
-    return SpecificationError(f"The object is a {kind}.", rule, nearest=nearest, kind=kind)

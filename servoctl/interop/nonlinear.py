@@ -4,19 +4,19 @@ import math
 
 import numpy as np
 
-from servoctl.checks import MOST_COUNT, as_list, positive, whole
+from servoctl.checks import MOST_COUNT, as_list, positive, require_kind, whole, without_effect
 from servoctl.control.conditions import limits, steps
 from servoctl.control.law import Law
 from servoctl.control.loop import hold, limited, quantised, samples_ago
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.interop.names import (
+    SYSTEMS,
     connected,
     disturbable_of,
     disturbed_names,
     output_names,
     signal_names,
-    stranger,
     system_name,
 )
 from servoctl.model.model import Model
@@ -61,23 +61,16 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     NameUnknown
         For a disturbance of what is no generalised force or parameter.
     """
-    given = as_list(disturbed) != []
-    if not isinstance(thing, Plant) and (rate is not None or substeps is not None or given):
-        raise SpecificationError(
-            f"rate, substeps or disturbed was given for a {type(thing).__name__}.",
-            "They apply to plants: laws and loops have a rate, models are continuous.",
-            do="Leave them out.",
-            kind=type(thing).__name__,
-        )
+    require_kind((Model, Plant, Law, Closed), "thing", thing, SYSTEMS)
     if isinstance(thing, Plant):
         return _plant(thing, system_name(name, "plant"), disturbed, rate, substeps)
+    given = {"rate": rate, "substeps": substeps, "disturbed": as_list(disturbed) or None}
+    without_effect([name for name, value in given.items() if value is not None], f"for a {type(thing).__name__}")
     if isinstance(thing, Model):
         return _model(thing, system_name(name, "model"))
     if isinstance(thing, Law):
         return _law(thing, system_name(name, "law"))
-    if isinstance(thing, Closed):
-        return _closed(thing, system_name(name, "loop"))
-    raise stranger(thing)
+    return _closed(thing, system_name(name, "loop"))
 
 
 def start(closed):
@@ -96,8 +89,7 @@ def start(closed):
     SpecificationError
         For anything but a closed loop.
     """
-    if not isinstance(closed, Closed):
-        raise stranger(closed, "The initial state is that of a Closed of sv.close.")
+    require_kind(Closed, "closed", closed, "sv.close(...)")
     loop, late = closed.loop, 0 if closed.loop.transport is None else closed.loop.transport
     past = loop.delay + _past_inputs(closed.plant, late, loop.substeps)
     return np.concatenate([loop.x0, np.tile(loop.initial_input, past), loop.z0])

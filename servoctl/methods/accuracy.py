@@ -8,11 +8,10 @@ difference is the error.
 """
 
 from dataclasses import replace
-from numbers import Real
 
 import numpy as np
 
-from servoctl.checks import is_number
+from servoctl.checks import within
 from servoctl.errors import IntegrationStopped, LimitExceeded, SpecificationError
 from servoctl.methods.choice import Adaptive, Algebraic, Automatic, Project, Taylor
 from servoctl.methods.sizes import motion_sizes, state_levels
@@ -183,15 +182,7 @@ def _out_of_reach(accuracy, best, growth, run):
 
 def require_accuracy(accuracy):
     """An accuracy as a float, or the error of one that is out of range."""
-    low, high = FINEST_ACCURACY, COARSEST_ACCURACY
-    if not (isinstance(accuracy, Real) and low <= accuracy <= high):
-        raise SpecificationError(
-            f"accuracy={accuracy!r} was given.",
-            f"An accuracy is the largest relative error of the motion, from {low:g} to {high:g}.",
-            nearest=f"{np.clip(accuracy, low, high):g}." if is_number(accuracy) else "",
-            accuracy=accuracy,
-        )
-    return float(accuracy)
+    return within("accuracy", accuracy, FINEST_ACCURACY, COARSEST_ACCURACY)
 
 
 def _jets_alone(accuracy, method, drift):

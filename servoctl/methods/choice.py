@@ -8,10 +8,10 @@ from servoctl.checks import (
     MOST_JETS,
     as_complex,
     by_name,
-    is_number,
     is_whole,
     mapping,
     named,
+    positive,
     positive_number,
     tolerance,
     whole_of,
@@ -52,7 +52,8 @@ class Poles:
     values: object
 
     def __post_init__(self):
-        checked = _poles_by_row(self.values) if isinstance(self.values, dict) else _time_constant(self.values)
+        by_row = isinstance(self.values, dict)
+        checked = _poles_by_row(self.values) if by_row else positive("time constant", self.values)
         object.__setattr__(self, "values", checked)
 
     def __hash__(self):
@@ -83,17 +84,6 @@ class Poles:
         """The coefficients c_0 .. c_(ρ-1) of each row's error dynamics, in the order of the model's pole inputs."""
         rows = [np.atleast_1d(np.poly(poles)).real[:0:-1] for poles in self.by_row(model).values()]
         return np.concatenate([*rows, np.zeros(0)])
-
-
-def _time_constant(value):
-    if not (is_number(value) and value > 0):
-        raise SpecificationError(
-            f"The time constant of the error dynamics is {value!r}.",
-            "It is a positive number of seconds.",
-            do="Pass a number such as 0.1, or poles by row name.",
-            value=value,
-        )
-    return float(value)
 
 
 def _poles_by_row(values):
@@ -158,9 +148,7 @@ def as_drift(value):
     if value is None or isinstance(value, (Poles, Project)):
         return value
     if isinstance(value, str):
-        if value not in SHORT_FORMS:
-            raise unknown(value, [*SHORT_FORMS, "a time constant [s]"], "drift treatment")
-        return SHORT_FORMS[value]
+        return SHORT_FORMS[named(value, SHORT_FORMS, "drift treatment")]
     return Poles(value)
 
 

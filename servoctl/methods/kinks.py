@@ -5,6 +5,7 @@ import numpy as np
 from servoctl.errors import ServoError
 from servoctl.methods.bounded import FreeEntries
 from servoctl.model.switching import switching
+from servoctl.values import evenly
 
 ON_SWITCH = 1e-6  # value of a switching function, of what the state's size changes it by, below which it is zero
 SAME_SIDES = 1e-6  # relative difference of two linearisations that is rounding
@@ -34,7 +35,7 @@ def stays_on_kink(model, run):
         return ""
     x = run.jets[: len(model.state_names)]
     known = np.flatnonzero(np.isfinite(x).all(axis=0))
-    some = known[np.linspace(0, len(known) - 1, STAYS_AT).round().astype(int)]
+    some = known[evenly(len(known), STAYS_AT)]
     found = [kink(model, run.t[k], x[:, k]) for k in some]
     return found[0] if all(found) else ""
 

@@ -43,7 +43,7 @@ from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.tolerances import ENTRY, RESOLVED
-from servoctl.values import read_only
+from servoctl.values import evenly, read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 AS_DERIVED = "as derived"  # a model with the parameters at which its ranks were decided
@@ -792,7 +792,7 @@ def _samples(model, motion, jets):
     if isinstance(motion, State):
         motion, names, jets = [motion.t], motion.names, motion.values[:, None]
     elif hasattr(motion, "jet_names"):
-        some = np.unique(np.linspace(0, len(motion.t) - 1, SAMPLED).round().astype(int))
+        some = evenly(len(motion.t), SAMPLED)
         motion, names, jets = motion.t[some], motion.jet_names, motion.jets[:, some]
     t, jets = np.atleast_1d(as_numbers(motion)), np.atleast_1d(as_numbers(jets))
     count = len(jets)

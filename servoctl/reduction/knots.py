@@ -13,7 +13,7 @@ from servoctl.jets.lookup import Lookup
 from servoctl.jets.pieces import FEWEST, by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
-from servoctl.values import frozen
+from servoctl.values import evenly, frozen
 
 MOST_BRANCHES = 24  # affine pieces that are followed through one operation
 SCAN = 801  # instants of a scan for switches that are not affine in t
@@ -360,7 +360,7 @@ def _of_affine(pieces, knots):
 
 def _some(knots):
     """The first and the last knots of a table and ones between, each with its neighbours: all are of the same kind."""
-    places = np.linspace(1, len(knots) - 2, INSPECTED).round().astype(int)
+    places = 1 + evenly(len(knots) - 2, INSPECTED)
     return knots[np.unique(np.concatenate([places - 1, places, places + 1]))]
 
 

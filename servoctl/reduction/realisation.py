@@ -19,6 +19,7 @@ from servoctl.reduction.appell import Realisation, plant_accelerations
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each
 from servoctl.reduction.rows import balances, settle_alone
+from servoctl.spec.coordinates import require_order
 from servoctl.spec.mechanism import inverse_directions
 
 
@@ -240,14 +241,7 @@ def _require_choices(mechanism, program):
     if program.metric == "inertia":
         _require_inertial(mechanism, program)
     for name, wish in program.toward.items():
-        if mechanism.q.order(ca.SX(wish)) > 1:
-            raise SpecificationError(
-                f"The wish of {name!r} contains accelerations or higher derivatives.",
-                "A wish is a force that is known before the accelerations: an expression of t, q and γ'.",
-                do="Write it by coordinates and velocities.",
-                name=name,
-                order=mechanism.q.order(ca.SX(wish)),
-            )
+        require_order(mechanism.q, ca.SX(wish), f"The wish of {name!r}", 1)
     if program.toward and len(program.residuals) == len(mechanism.actuators):
         raise SpecificationError(
             f"There are wishes of {', '.join(program.toward)}, and {len(program.residuals)} residuals determine the "

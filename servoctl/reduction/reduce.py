@@ -7,7 +7,7 @@ from itertools import chain
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import by_name, distinct, finite, mapping, named
+from servoctl.checks import by_name, distinct, finite, mapping, named, require_kind
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
 from servoctl.jets.branches import cse
 from servoctl.jets.series import Flow
@@ -274,15 +274,8 @@ def strong(pivots, before):
 
 def require_parts(mechanism, program, guess):
     """The program by the mechanism's names; refuse what is none, unknown symbols, equal names, and unknown guesses."""
-    for value, kind in ((mechanism, Mechanism), (program, Program)):
-        if not isinstance(value, kind):
-            raise SpecificationError(
-                f"Expected a {kind.__name__}, got a {type(value).__name__}.",
-                "A model is derived from a mechanism and a program, in this order.",
-                do="Write sv.derive(mechanism, program).",
-                expected=kind.__name__,
-                type=type(value).__name__,
-            )
+    require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
+    require_kind(Program, "program", program, "sv.Program({...})")
     q, guess = mechanism.q, mapping(guess, "The guesses")
     for name, expression in program.residuals.items():
         require_known(expression, mechanism, f"the residual {name!r}")

@@ -9,6 +9,7 @@ from xml.parsers import expat
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import named, require_kind, within
 from servoctl.errors import SpecificationError, unknown
 from servoctl.values import frozen
 
@@ -122,14 +123,7 @@ def _bytes(source):
         return source.encode(errors="surrogatepass"), "utf-8"
     if isinstance(source, bytes):
         return source, None
-    if not isinstance(source, (str, Path)):
-        raise SpecificationError(
-            f"The source of the robot is a {type(source).__name__}.",
-            "It is the path of a URDF file, or its text.",
-            do='Write sv.urdf("robot.urdf").',
-            type=type(source).__name__,
-        )
-    path = Path(source)
+    path = Path(require_kind((str, Path), "The source of the robot", source, 'Path("robot.urdf")'))
     try:
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
@@ -247,11 +241,7 @@ def _inertial(link, name):
     tag = _one(node, "inertia", what)
     ixx, ixy, ixz, iyy, iyz, izz = (_one_number(tag, key, what, 0.0) for key in MOMENTS)
     inertia = ca.DM([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-    if mass < 0.0:
-        raise SpecificationError(
-            f"The mass of link {name!r} is {mass:g} kg.", "A mass is at least zero.", "0.", link=name, mass=mass
-        )
-    return Inertial(mass, ca.DM.zeros(3), inertia).moved(rotation, offset)
+    return Inertial(within(f"the mass of {what}", mass, least=0.0), ca.DM.zeros(3), inertia).moved(rotation, offset)
 
 
 def _joint(node, name, armature):
@@ -334,10 +324,7 @@ def _axis(node, what):
 
 
 def _resistance(node, key, what):
-    value = _one_number(node, key, what, 0.0)
-    if value < 0.0:
-        raise SpecificationError(f"The {key} of {what} is {value:g}.", "It is at least zero.", "0.", joint=what)
-    return value
+    return within(f"the {key} of {what}", _one_number(node, key, what, 0.0), least=0.0)
 
 
 def _one_number(node, key, what, default=None):
@@ -370,7 +357,6 @@ def _finite_numbers(node, key, what, default="", count=3):
 def _require_known(joint, links, joints):
     """Refuse a joint between links, or like a joint, that are not there."""
     for name in (joint.parent, joint.child):
-        if name not in links:
-            raise unknown(name, links, f"link (as joint {joint.name!r} needs it)")
-    if joint.mimic and joint.mimic[0] not in joints:
-        raise unknown(joint.mimic[0], joints, f"joint (as joint {joint.name!r} mimics it)")
+        named(name, links, f"link (as joint {joint.name!r} needs it)")
+    if joint.mimic:
+        named(joint.mimic[0], joints, f"joint (as joint {joint.name!r} mimics it)")

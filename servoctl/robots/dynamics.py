@@ -19,6 +19,18 @@ class Axis:
     acceleration: ca.SX
     rows: tuple[tuple[int, float], ...]
 
+    def parts(self, jet):
+        """What turns and what slides of a value, rate or acceleration of the joint, in the body's axes."""
+        if self.motion == "free":
+            return jet[3:], jet[:3]
+        along, nothing = along_z(jet[0]), ca.SX.zeros(3)
+        return (along, nothing) if self.motion == "turn" else (nothing, along)
+
+    @property
+    def units(self):
+        """What turns and what slides for a unit of each velocity."""
+        return [self.parts(unit) for unit in ca.horzsplit(ca.SX.eye(len(self.rows)))]
+
 
 class Kinematics:
     """Rotations and offsets of the bodies in the world, and their velocities in their own axes.
@@ -31,7 +43,7 @@ class Kinematics:
         self.tree, self.axes = tree, axes
         self.rotations, self.offsets, self.omega, self.speed = [], [], [], []
         self.locals = list(map(_local, axes))
-        self.along = [_carried(axis) for axis in axes]
+        self.along = [axis.parts(axis.value)[1] for axis in axes]
         for body, axis in zip(tree.bodies, axes, strict=True):
             self._place(body, axis)
             self._move(body, axis)
@@ -69,10 +81,7 @@ class Kinematics:
         i = len(self.omega)
         outer, speed = self.parent(self.omega, i), self.parent(self.speed, i)
         carried = self.into(i, speed + ca.cross(outer, self.arm(i)))
-        if body.motion == "free":
-            spin, slide = axis.rate[3:], axis.rate[:3]
-        else:
-            spin, slide = (along_z(axis.rate[0]) if body.motion == kind else 0 for kind in ("turn", "slide"))
+        spin, slide = axis.parts(axis.rate)
         self.omega.append(self.into(i, outer) + spin)
         self.speed.append(carried + slide)
 
@@ -88,17 +97,10 @@ def inverse_dynamics(kinematics, n):
         outer, arm = kinematics.parent(kinematics.omega, i), kinematics.arm(i)
         alpha, acceleration = kinematics.parent(alphas, i), kinematics.parent(accelerations, i)
         acceleration = into(i, acceleration + ca.cross(alpha, arm) + ca.cross(outer, ca.cross(outer, arm)))
+        (spin, slide), (spun, slid) = axis.parts(axis.rate), axis.parts(axis.acceleration)
         alpha, outer = into(i, alpha), into(i, outer)
-        if body.motion == "turn":
-            spin = along_z(axis.rate[0])
-            alpha = alpha + ca.cross(outer, spin) + along_z(axis.acceleration[0])
-        elif body.motion == "slide":
-            slide = along_z(axis.rate[0])
-            acceleration = acceleration + 2 * ca.cross(outer, slide) + along_z(axis.acceleration[0])
-        else:
-            slide, spin = axis.rate[:3], axis.rate[3:]
-            alpha = alpha + ca.cross(outer, spin) + axis.acceleration[3:]
-            acceleration = acceleration + ca.cross(2 * outer + spin, slide) + axis.acceleration[:3]
+        alpha = alpha + ca.cross(outer, spin) + spun
+        acceleration = acceleration + ca.cross(2 * outer + spin, slide) + slid
         alphas.append(alpha)
         accelerations.append(acceleration)
         force, couple = _inertial_load(body.inertial, kinematics.omega[i], alpha, acceleration)
@@ -152,13 +154,6 @@ def _local(axis):
     return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
 
 
-def _carried(axis):
-    """Offset of a body in the frame of its placement."""
-    if axis.motion == "free":
-        return axis.value[:3]
-    return along_z(axis.value[0]) if axis.motion == "slide" else ca.SX.zeros(3)
-
-
 def along_z(value):
     """The vector (0, 0, value)."""
     return ca.vertcat(0, 0, value)
@@ -177,10 +172,8 @@ def _projected(kinematics, forces, couples, n):
     rows = [0] * n
     for i in reversed(range(len(forces))):
         body, axis = kinematics.tree.bodies[i], kinematics.axes[i]
-        load = {"turn": [couples[i][2]], "slide": [forces[i][2]]}.get(body.motion)
-        load = [*forces[i].elements(), *couples[i].elements()] if load is None else load
-        for (row, factor), value in zip(axis.rows, load, strict=True):
-            rows[row] += factor * value
+        for (row, factor), (turn, slide) in zip(axis.rows, axis.units, strict=True):
+            rows[row] += factor * (ca.dot(couples[i], turn) + ca.dot(forces[i], slide))
         if body.parent is not None:
             force, couple = kinematics.out_of(i, forces[i]), kinematics.out_of(i, couples[i])
             forces[body.parent] = forces[body.parent] + force
@@ -197,14 +190,13 @@ def mass_matrix(kinematics, n):
     composites = [body.inertial for body in bodies]
     M = ca.SX.zeros(n, n)
     for i in reversed(range(len(bodies))):
-        directions = _units_of_motion(bodies[i])
-        loads = [_inertial_load(composites[i], ca.SX.zeros(3), alpha, a) for alpha, a in directions]
+        loads = [_inertial_load(composites[i], ca.SX.zeros(3), alpha, a) for alpha, a in axes[i].units]
         for k, ((row, factor), load) in enumerate(zip(axes[i].rows, loads, strict=True)):
             j, columns = i, range(k + 1)
             while j is not None:
                 for c in columns:
                     other, scale = axes[j].rows[c]
-                    alpha, a = _units_of_motion(bodies[j])[c]
+                    alpha, a = axes[j].units[c]
                     entry = factor * scale * (ca.dot(a, load[0]) + ca.dot(alpha, load[1]))
                     M[row, other] += entry
                     if (j, c) != (i, k):
@@ -212,17 +204,9 @@ def mass_matrix(kinematics, n):
                 force, couple = kinematics.out_of(j, load[0]), kinematics.out_of(j, load[1])
                 load = force, couple + ca.cross(kinematics.arm(j), force)
                 j = bodies[j].parent
-                columns = range(6 if j is not None and bodies[j].motion == "free" else 1)
+                columns = () if j is None else range(len(axes[j].rows))
         if (parent := bodies[i].parent) is not None:
             inner = composites[i].moved(kinematics.locals[i], kinematics.along[i])
             placement = bodies[i].placement
             composites[parent] = composites[parent] + inner.moved(placement.rotation, placement.offset)
     return M
-
-
-def _units_of_motion(body):
-    """Angular and linear acceleration of a body for a unit of each of its velocities."""
-    zero, e = ca.SX.zeros(3), ca.horzsplit(ca.SX.eye(3))
-    if body.motion == "free":
-        return [*((zero, axis) for axis in e), *((axis, zero) for axis in e)]
-    return [(e[2], zero) if body.motion == "turn" else (zero, e[2])]

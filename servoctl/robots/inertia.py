@@ -3,7 +3,8 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import named
+from servoctl.errors import SpecificationError
 from servoctl.robots.description import Inertial
 from servoctl.robots.joints import identifier
 from servoctl.spec.parameters import Parameters
@@ -16,9 +17,7 @@ def with_symbols(description, links):
     """Parameters of symbolic links, and the inertia of all links."""
     inertials, numbers, names = dict(description.links), {}, set()
     for link in links:
-        if link not in inertials:
-            raise unknown(link, inertials, "link")
-        if link not in numbers:
+        if named(link, inertials, "link") not in numbers:
             names.add(name := identifier(link, names))
             numbers[link] = {f"{name}_{key}": value for key, value in _numbers_of(inertials[link]).items()}
     parameters = Parameters({name: value for own in numbers.values() for name, value in own.items()})

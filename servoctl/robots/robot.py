@@ -7,7 +7,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_list, column, finite, mapping, named, numbers_by_name, texts
+from servoctl.checks import array_of, as_list, column, finite, mapping, named, numbers_by_name, texts, within
 from servoctl.errors import SpecificationError
 from servoctl.robots.description import described
 from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
@@ -243,11 +243,9 @@ class Robot:
         while body is not None:
             rotation, arm = self._kinematics.rotations[body], position - self._kinematics.offsets[body]
             axis = self._axes[body]
-            directions = ca.horzsplit(rotation) * 2 if axis.motion == "free" else [rotation[:, 2]]
-            for k, ((row, factor), e) in enumerate(zip(axis.rows, directions, strict=True)):
-                slides = axis.motion == "slide" or axis.motion == "free" and k < 3
-                column = ca.vertcat(e, ca.SX.zeros(3)) if slides else ca.vertcat(ca.cross(e, arm), e)
-                result[:, row] += factor * column
+            for (row, factor), unit in zip(axis.rows, axis.units, strict=True):
+                turn, slide = (rotation @ part for part in unit)
+                result[:, row] += factor * ca.vertcat(slide + ca.cross(turn, arm), turn)
             body = self._tree.bodies[body].parent
         return result
 
@@ -265,9 +263,7 @@ class Robot:
                 do="Pass friction=0.01, a speed in rad/s or m/s, or friction=0 to leave it out.",
                 joints=list(self.friction),
             )
-        speed = finite("friction", 0.0 if friction is None else friction)
-        if speed < 0.0:
-            raise SpecificationError(f"friction={speed:g} is given.", "It is a speed, at least zero.", "0.")
+        speed = within("friction", 0.0 if friction is None else friction, least=0.0)
         rotors = numbers_by_name(armature, self._moving, "joint that can be driven", "rotor inertia", low=0.0)
         rotors = {joint.name: rotors.get(name, joint.armature) for name, joint in self._moving.items()}
         rows = ca.SX.zeros(self.q.n)
@@ -359,10 +355,5 @@ def _unit(names, quaternion):
 
 def _field(gravity):
     """The vector of gravity."""
-    entries = as_list(gravity) or [gravity]
-    if len(entries) not in (1, 3):
-        raise SpecificationError(
-            f"gravity has {len(entries)} entries.", "It is a number along -z, or a vector of three."
-        )
-    numbers = [finite("gravity", value) for value in entries]
-    return np.array(numbers if len(numbers) == 3 else [0.0, 0.0, -numbers[0]])
+    along_z = as_list(gravity) is None
+    return array_of("gravity", [0.0, 0.0, -finite("gravity", gravity)] if along_z else gravity, 3)

@@ -4,7 +4,8 @@ from dataclasses import field, replace
 
 import numpy as np
 
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import named
+from servoctl.errors import SpecificationError
 from servoctl.robots.description import Inertial, Joint, without_rounding
 from servoctl.values import frozen
 
@@ -76,6 +77,13 @@ def tree(description, base, lock, inertials):
             moved = inertials[link].moved(placement.rotation, placement.offset)
             bodies[body] = replace(bodies[body], inertial=bodies[body].inertial + moved)
         waiting += [(joint.child, joint, body, placement) for joint in reversed(children.get(link, []))]
+    if lost := [link for link in description.links if link not in places]:
+        raise SpecificationError(
+            f"The links {', '.join(lost[:5])} hang on a loop of joints, not on the root {root!r}.",
+            "The joints of a URDF file form a tree.",
+            do="Remove a joint of the loop.",
+            links=lost,
+        )
     return Tree(tuple(bodies), places)
 
 
@@ -86,8 +94,7 @@ def with_followers(description, lock):
     positions, and joints that mimic each other, or one that has several positions.
     """
     for name in lock:
-        if name not in description.joints:
-            raise unknown(name, description.joints, "joint")
+        named(name, description.joints, "joint")
         if description.joints[name].kind not in ONE_AXIS:
             raise SpecificationError(
                 f"The {description.joints[name].kind} joint {name!r} is locked at {lock[name]:g}.",
@@ -138,27 +145,7 @@ def _root_link(description):
             do="Connect them by fixed joints." if roots else "Remove a joint of the loop.",
             roots=roots,
         )
-    _refuse_loop(description, roots[0])
     return roots[0]
-
-
-def _refuse_loop(description, root):
-    """Refuse links that joints connect to each other and not to the root."""
-    children = {}
-    for joint in description.joints.values():
-        children.setdefault(joint.parent, []).append(joint.child)
-    reached, waiting = set(), [root]
-    while waiting:
-        link = waiting.pop()
-        reached.add(link)
-        waiting += children.get(link, [])
-    if lost := [link for link in description.links if link not in reached]:
-        raise SpecificationError(
-            f"The links {', '.join(lost[:5])} hang on a loop of joints, not on the root {root!r}.",
-            "The joints of a URDF file form a tree.",
-            do="Remove a joint of the loop.",
-            links=lost,
-        )
 
 
 def _beyond(joint, body, placement, lock, bodies):

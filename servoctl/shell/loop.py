@@ -3,8 +3,8 @@
 import math
 
 import servoctl as sv
-from servoctl.checks import named
-from servoctl.errors import ServoError, SpecificationError
+from servoctl.checks import named, without_effect
+from servoctl.errors import ServoError
 from servoctl.figures.style import write_png
 from servoctl.shell.options import MANY, assignment, by_name, deviation, limits, positive, used, whole
 from servoctl.verification.remarks import SAMPLES, least_rate
@@ -34,13 +34,13 @@ def add_loop(parser):
 def require(args, model):
     """Refuse options of the loop that have no effect, and names that the mechanism does not have."""
     if args.no_loop:
-        _refuse(used(args, GIVEN), "with --no-loop")
+        without_effect(used(args, GIVEN), "with --no-loop")
     if args.law not in (None, "lqr"):
-        _refuse(used(args, ("integral",)), f"with --law {args.law}")
+        without_effect(used(args, ("integral",)), f"with --law {args.law}")
     if args.law == "feedforward":
-        _refuse(used(args, ("noise",)), "with --law feedforward, which measures nothing")
+        without_effect(used(args, ("noise",)), "with --law feedforward, which measures nothing")
     if not args.noise:
-        _refuse(used(args, ("seed",)), "with no --noise")
+        without_effect(used(args, ("seed",)), "with no --noise")
     mechanism = model.reduction.mechanism
     valid = {
         "machine": (mechanism.parameters.names, "parameter"),
@@ -50,16 +50,6 @@ def require(args, model):
     for option, (names, what) in valid.items():
         for name in by_name(getattr(args, option), f"--{option}"):
             named(name, names, what)
-
-
-def _refuse(options, why):
-    if options:
-        raise SpecificationError(
-            f"{', '.join(options)} was given {why}.",
-            "It would have no effect.",
-            do="Leave one of them out.",
-            options=options,
-        )
 
 
 def closed_loop(args, model, plan, report):

@@ -70,13 +70,9 @@ def _named(read, form):
     return _typed(split, form)
 
 
-def _number(above=-math.inf):
-    """A reader of finite numbers greater than a bound."""
-    return lambda text: float(text) if above < float(text) < math.inf else None
-
-
-def _deviation(text):
-    return float(text) if 0 <= float(text) < math.inf else None
+def _number(above=-math.inf, least=-math.inf):
+    """A reader of finite numbers that are greater than a bound, and at least another one."""
+    return lambda text: float(text) if above < float(text) < math.inf and least <= float(text) else None
 
 
 def _at_least(least, most=math.inf):
@@ -98,5 +94,5 @@ positive = _typed(_number(above=0.0), "not a positive number")
 drift = _typed(_drift, "not none, project or a time constant [s]")
 _pair = "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
 assignment = _named(_number(), _pair)
-deviation = _named(_deviation, "not NAME=STD with STD >= 0, such as theta=0.001")
+deviation = _named(_number(least=0.0), "not NAME=STD with STD >= 0, such as theta=0.001")
 limits = _named(_limits, "neither NAME=LOW:HIGH nor NAME=SIZE, such as trolley=150")

@@ -144,7 +144,7 @@ def _planned(args, motion, report):
             request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
             run = request.relaxed(after, start, moving=not method and found.dynamics != MARGINAL)
             if args.samples:
-                run = resampled(run, np.array(options["t_eval"]))
+                run = resampled(run, options["t_eval"])
                 run = replace(run, jets=run.model.with_highest(run.t, run.jets[: len(run.model.state_names)]))
             return motion, run, ""
     except ServoError as error:
@@ -160,8 +160,7 @@ def _options(args, model, span):
     if args.method or settings:
         options["method"] = as_method(args.method or default_method(model), **settings)
     if args.samples:
-        (t0, t1), intervals = span, args.samples - 1
-        options["t_eval"] = [t0 + (t1 - t0) * i / intervals for i in range(intervals)] + [t1]
+        options["t_eval"] = np.linspace(*span, args.samples)
     return options
 
 

@@ -1,13 +1,13 @@
 """A scene by name: from the gallery, or from a user's file."""
 
 import importlib.util
-import math
 import os
 import sys
 import traceback
 from pathlib import Path
 
 import servoctl as sv
+from servoctl.checks import is_number
 from servoctl.errors import ServoError, SpecificationError, unknown
 
 _MODULE = "servoctl_scene"  # name of the module made from a user's file, so that it shadows no other module
@@ -140,18 +140,14 @@ def _advice(module):
     return "Define scene()."
 
 
-def _number(value):
-    return isinstance(value, (int, float)) and math.isfinite(value)
-
-
 def _numbers(value):
-    return isinstance(value, dict) and all(isinstance(k, str) and _number(v) for k, v in value.items())
+    return isinstance(value, dict) and all(isinstance(k, str) and is_number(v) for k, v in value.items())
 
 
 SETTINGS = {  # of a scene's file: the check of a value, and an example
     "START": (_numbers, '{"theta": 0.1}'),
     "GUESS": (_numbers, '{"theta": 0.1}'),
-    "T_SPAN": (lambda v: isinstance(v, (tuple, list)) and len(v) == 2 and all(map(_number, v)), "(0.0, 2.0)"),
+    "T_SPAN": (lambda v: isinstance(v, (tuple, list)) and len(v) == 2 and all(map(is_number, v)), "(0.0, 2.0)"),
     "UNITS": (lambda v: isinstance(v, dict) and all(isinstance(n, str) for n in (*v, *v.values())), '{"theta": "rad"}'),
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 from servoctl.checks import column, matrix, require_kind
 from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread
-from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.coordinates import Coordinates, require_order
 from servoctl.tolerances import ENTRY
 
 
@@ -94,11 +94,7 @@ def body_rates(q: Coordinates, rotation):
     (3,) SX
     """
     require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
-    rotation = matrix(rotation, "the rotation")
-    if rotation.shape != (3, 3):
-        raise SpecificationError(
-            f"The rotation has the shape {rotation.shape}.", "A rotation matrix is 3 by 3.", shape=rotation.shape
-        )
+    rotation = matrix(rotation, "the rotation", (3, 3))
     spin = rotation.T @ ca.reshape(q.dt(ca.vec(rotation)), 3, 3)
     return ca.vertcat(spin[2, 1] - spin[1, 2], spin[0, 2] - spin[2, 0], spin[1, 0] - spin[0, 1]) / 2
 
@@ -143,28 +139,11 @@ def _refuse_rates(q, omega, alpha, J):
 
 def _acceleration(q, position, what):
     require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
-    entries = column(position, what)
-    if not 1 <= len(entries) <= 3:
-        raise SpecificationError(
-            f"{what.capitalize()} has {len(entries)} entries.", "A position has one to three.", entries=len(entries)
-        )
-    position = ca.vertcat(*entries)
-    if q.order(position) > 0:
-        raise SpecificationError(
-            f"{what.capitalize()} depends on velocities.",
-            "A position is a function of the coordinates and t.",
-            do="Pass the position; velocities and accelerations are derived.",
-            order=q.order(position),
-        )
+    position = ca.vertcat(*column(position, what, 1, 2, 3))
+    require_order(q, position, what, 0)
     return q.dt(position, 2)
 
 
 def _inertia(inertia):
-    inertia = matrix(inertia, "the inertia")
-    if inertia.shape in ((3, 1), (1, 3)):
-        return ca.diag(inertia)
-    if inertia.shape == (3, 3):
-        return inertia
-    raise SpecificationError(
-        f"The inertia has the shape {inertia.shape}.", "It is (3, 3), or (3,) for a diagonal.", shape=inertia.shape
-    )
+    inertia = matrix(inertia, "the inertia", (3, 3), (3, 1), (1, 3))
+    return inertia if inertia.shape == (3, 3) else ca.diag(inertia)

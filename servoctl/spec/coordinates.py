@@ -6,7 +6,7 @@ from math import factorial
 
 import casadi as ca
 
-from servoctl.checks import as_list, column, is_whole, mapping, matrix, named, require_kind
+from servoctl.checks import as_list, column, is_whole, mapping, matrix, named, require_kind, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero
@@ -134,14 +134,7 @@ class Coordinates:
             If sizes disagree or a name is taken.
         """
         names = _identifiers(names, "quasi-velocities")
-        V = matrix(V, "V")
-        if V.shape != (self.nq, len(names)):
-            raise SpecificationError(
-                f"V has the shape {V.shape}.",
-                f"In q' = V w + h there are {self.nq} coordinates and {len(names)} quasi-velocities.",
-                f"({self.nq}, {len(names)}).",
-                shape=V.shape,
-            )
+        V = matrix(V, "V", (self.nq, len(names)))
         other = Coordinates(self.names, self.units)
         other.t, other._q, other.plain = self.t, self._q, False
         other._index = {key: value for key, value in self._index.items() if value[0] != "w"}
@@ -398,15 +391,22 @@ def _moved(names, units, velocity_names, frame, invariants, identity):
     return moved
 
 
-def _order(k, least=0):
-    if not is_whole(k) or not least <= k <= MOST_ORDER:
+def require_order(q, expression, what, most):
+    """Refuse an expression with higher derivatives of q than γ^(most); `what` it is begins the message."""
+    order = q.order(expression)
+    if order > most:
         raise SpecificationError(
-            f"The order of a derivative is {k!r}."[:150],
-            f"An order is a whole number from {least} to {MOST_ORDER}.",
-            do="Write q.d(1), q.w(1) or q.dt(expression, 2).",
-            order=k,
+            f"{what} has the order {order} in the jets.",
+            f"Its order is at most {most}: {('coordinates and t', 'velocities', 'accelerations')[min(most, 2)]}.",
+            do="Write it by lower derivatives, which are known where it is evaluated.",
+            what=what,
+            order=order,
+            limit=most,
         )
-    return int(k)
+
+
+def _order(k, least=0):
+    return whole_of("order", k, range(least, MOST_ORDER + 1))
 
 
 def jet_name(name, k, plain=True):
@@ -416,18 +416,12 @@ def jet_name(name, k, plain=True):
 
 
 def _identifiers(names, what):
-    if not isinstance(names, str) or not names.split():
+    if not isinstance(names, str) or not names.split() or "," in names:
         raise SpecificationError(
             f"The names of the {what} are {names!r}.",
-            "Names are a text, separated by blanks.",
+            "Names are a text, separated by blanks without commas.",
+            nearest=repr(" ".join(names.replace(",", " ").split())) + "." if isinstance(names, str) else "",
             do='Write, for example, "x y theta".',
-            names=names,
-        )
-    if "," in names:
-        raise SpecificationError(
-            f"The names of the {what} are {names!r}.",
-            "Separate names by blanks, without commas.",
-            nearest=repr(" ".join(names.replace(",", " ").split())) + ".",
             names=names,
         )
     names = tuple(names.split())

@@ -15,7 +15,7 @@ from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.markup import Shown, listed
 from servoctl.spec.bodies import lagrange
-from servoctl.spec.coordinates import Coordinates, jet_name, symbols_in
+from servoctl.spec.coordinates import Coordinates, jet_name, require_order, symbols_in
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.shapes import as_shapes
@@ -541,35 +541,15 @@ class Mechanism(Shown):
     def _directions(self, actuators):
         columns = []
         for name, value in actuators.items():
-            what = f"actuator {name!r}"
-            items = column(value, what)
-            if not items:
+            items, what = column(value, f"actuator {name!r}"), f"the displacement of {name!r}"
+            direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) != 1
+            if direction:
+                what = f"the direction of {name!r} along {', '.join(self.q.velocity_names)}"
+            expression = self._known(items, what, self.q.n if direction else 1)
+            require_order(self.q, expression, what, 0)
+            if not direction and self.q.order(expression) < 0:
                 raise SpecificationError(
-                    f"{what} is empty.", "An actuator has a displacement or a direction.", name=name
-                )
-            direction = isinstance(value, (list, tuple, np.ndarray)) or len(items) > 1
-            if direction and len(items) != self.q.n:
-                rates = ", ".join(self.q.velocity_names)
-                raise SpecificationError(
-                    f"{what} has {len(items)} entries.",
-                    f"A direction has {self.q.n}, one for each of {rates}; a displacement is one scalar.",
-                    do="Change the number of entries, or pass a scalar displacement.",
-                    name=name,
-                    entries=len(items),
-                )
-            expression = self._known(items, what, len(items))
-            order = self.q.order(expression)
-            if order > 0:
-                raise SpecificationError(
-                    f"The {'direction' if direction else 'displacement'} of {what} depends on velocities.",
-                    "Displacements and directions are functions of q and t.",
-                    do="Use the coordinates instead of the velocities.",
-                    name=name,
-                    order=order,
-                )
-            if not direction and order < 0:
-                raise SpecificationError(
-                    f"The displacement of {what} depends on no coordinate.",
+                    f"The displacement of {name!r} depends on no coordinate.",
                     "An actuator works on a displacement, or along a direction of n entries.",
                     do="Use a function of q, or a sequence.",
                     name=name,
@@ -588,15 +568,8 @@ class Mechanism(Shown):
             ("The shape", self.shapes, 0),
         ):
             for name, expression in items.items():
-                if expression is not None and self.q.order(expression) > limit:
-                    raise SpecificationError(
-                        f"{what}{f' {name!r}' if name else ''} has order {self.q.order(expression)} in the jets.",
-                        f"Its order is at most {limit}.",
-                        do="Use lower derivatives; constraints of higher order are program constraints.",
-                        name=name,
-                        order=self.q.order(expression),
-                        limit=limit,
-                    )
+                if expression is not None:
+                    require_order(self.q, expression, f"{what}{f' {name!r}' if name else ''}", limit)
 
     def _keep_names_apart(self):
         """Give longer names to actuators, outputs and parameters that bear the name of a signal before them."""

@@ -12,13 +12,12 @@ arguments. A path along a time law has the lower of both classes.
 """
 
 import functools
-import itertools
 import math
 
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_list, as_numbers, column, is_number, is_whole, named
+from servoctl.checks import as_list, as_numbers, column, named, positive, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.lookup import columns_at
 
@@ -415,32 +414,21 @@ def _require_passing(pieces, points, half):
 def _from_ends(m):
     """Polynomials of degree 2m + 1 on (-1, 1) by their Taylor coefficients 0 .. m at -1, then at 1.
 
-    Returns the powers 0 .. 2m + 1 (rows) of each, and the integrals of products of their derivatives m + 1; both are
-    computed in fractions.
+    Returns the powers 0 .. 2m + 1 (rows) of each, and the integrals of products of their derivatives m + 1, those of
+    degree 2m by Gauss. That of coefficient j at -1 is (1 + x)^j r^(m + 1) sum_(k=0..m-j) binomial(m + k, k) l^k with
+    l = (1 + x)/2 and r = (1 - x)/2; those at 1 are its mirror images.
     """
-    from fractions import Fraction
-
-    size = 2 * m + 2
-    rows = [
-        [Fraction(math.comb(p, j) * side ** (p - j)) if p >= j else Fraction(0) for p in range(size)]
-        for side in (-1, 1)
-        for j in range(m + 1)
-    ]
-    rows = [row + [Fraction(int(i == j)) for j in range(size)] for i, row in enumerate(rows)]
-    for k in range(size):
-        pivot = next(i for i in range(k, size) if rows[i][k])
-        rows[k], rows[pivot] = rows[pivot], rows[k]
-        rows[k] = [e / rows[k][k] for e in rows[k]]
-        for i in set(range(size)) - {k}:
-            rows[i] = [e - rows[i][k] * f for e, f in zip(rows[i], rows[k], strict=True)]
-    powers = np.array([row[size:] for row in rows])
-    falling = [math.perm(p, m + 1) for p in range(size)]
-    products = np.full((size, size), Fraction(0))
-    for p, r in itertools.product(range(m + 1, size), repeat=2):
-        if (p + r) % 2 == 0:
-            products[p, r] = Fraction(2 * falling[p] * falling[r], p + r - 2 * m - 1)
-    energy = powers.T @ products @ powers
-    return powers.astype(float), (energy / energy[0, 0]).astype(float)
+    x = np.polynomial.Polynomial([0.0, 1.0])
+    left, right = (1 + x) / 2, (1 - x) / 2
+    basis = []
+    for j in range(m + 1):
+        series = sum(math.comb(m + k, k) * left**k for k in range(m + 1 - j))
+        basis.append((1 + x) ** j * right ** (m + 1) * series)
+    basis += [(-1) ** j * polynomial(-x) for j, polynomial in enumerate(basis)]
+    nodes, weights = np.polynomial.legendre.leggauss(m + 1)
+    slopes = np.array([polynomial.deriv(m + 1)(nodes) for polynomial in basis])
+    energy = slopes * weights @ slopes.T
+    return np.column_stack([polynomial.coef for polynomial in basis]), energy / energy[0, 0]
 
 
 def _symbolic_pieces(times, points, m, ends):
@@ -471,20 +459,13 @@ def _symbolic_pieces(times, points, m, ends):
 def _via_points(times, points):
     """The times (n,) and points (n, dim) of a spline: arrays of numbers, or SX where they contain symbols."""
     times, points = _entries(times, "times"), _entries(points, "points")
-    if not all(isinstance(e, ca.SX) or np.isfinite(e).all() for e in (times, points)):
-        raise SpecificationError(
-            "The spline's times or points are not all finite numbers.",
-            "Times and points are numbers or expressions, of shapes (n,) and (n,) or (n, dim).",
-            do="Put points in rows, and their entries in columns.",
-            times=times,
-            points=points,
-        )
+    finite = all(isinstance(e, ca.SX) or np.isfinite(e).all() for e in (times, points))
     shapes = [e.shape[:1] if isinstance(e, ca.SX) and e.shape[1] == 1 else e.shape for e in (times, points)]
     fit = len(shapes[0]) == 1 and len(shapes[1]) in (1, 2) and shapes[0][0] == shapes[1][0] >= 2
-    if not fit or 0 in shapes[1]:
+    if not finite or not fit or 0 in shapes[1]:
         raise SpecificationError(
             f"The spline's times have the shape {shapes[0]}, its points {shapes[1]}.",
-            "There are at least two times, and one point for each.",
+            "There are at least two times, and one point for each: finite numbers or expressions.",
             do="Put points in rows, and their entries in columns.",
             times=shapes[0],
             points=shapes[1],
@@ -544,40 +525,20 @@ def _column(value, what):
 
 def _scalar(value, what):
     """An SX scalar: an expression, or a finite number."""
-    value = _column(value, what)
-    if value.numel() != 1:
-        raise SpecificationError(
-            f"{what} has {value.numel()} entries.",
-            f"A path is an expression of one scalar {what}.",
-            do="Use q.t, a scalar path, a parameter or a number; a casadi.Function of a path tabulates it.",
-            what=what,
-            size=value.numel(),
-        )
-    return value
+    return column(value, what, 1)[0]
 
 
 def _positive(value, what):
     """An SX scalar that is an expression, or a number greater than zero."""
     value = _scalar(value, what)
-    if value.is_constant() and float(value) <= 0:
-        nearest = f"{what} = {-float(value):g}." if float(value) < 0 else ""
-        raise SpecificationError(
-            f"{what} = {value}.", f"The {what} of a path is positive.", nearest, what=what, value=float(value)
-        )
+    if value.is_constant():
+        positive(what, float(value))
     return value
 
 
 def _smoothness(k, least=0, most=SMOOTHEST):
     """The k of a class C^k as an int."""
-    if not is_whole(k) or not least <= k <= most:
-        raise SpecificationError(
-            f"smoothness={k!r}."[:200],
-            f"The smoothness k of a path of class C^k is a whole number, at least {least} and at most {most}.",
-            f"smoothness={min(max(least, math.ceil(k)), most)}." if is_number(k) else "",
-            "The error for a path of too low a class names the class that a program needs.",
-            smoothness=k,
-        )
-    return int(k)
+    return whole_of("smoothness", k, range(least, most + 1))
 
 
 def _orthonormal(axes, centre):

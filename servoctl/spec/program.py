@@ -3,8 +3,8 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, mapping, require_kind
-from servoctl.errors import SpecificationError, unknown
+from servoctl.checks import column, finite, mapping, named, positive, require_kind, within, without_effect
+from servoctl.errors import SpecificationError
 from servoctl.jets.branches import as_text, without_turns
 from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
@@ -43,7 +43,9 @@ class Program(Packed):
     Raises
     ------
     SpecificationError
-        If there is no residual, one is no scalar expression, or `by` is another word.
+        If there is no residual, or one is no scalar expression.
+    NameUnknown
+        If `by` is another word.
     """
 
     def __init__(self, residuals, by="actuators", weights=None, toward=None):
@@ -54,23 +56,10 @@ class Program(Packed):
                 do='Write {"X": expression, ...}.',
                 residuals=residuals,
             )
-        if not isinstance(by, str) or by not in REALISATIONS:
-            match = unknown(by, REALISATIONS, "realisation").details["match"]
-            raise SpecificationError(
-                f"by={by!r}.",
-                "A program is realised by 'ideal' reactions or by the mechanism's 'actuators'.",
-                nearest=repr(match) if match else "",
-                by=by,
-            )
+        named(by, REALISATIONS, "realisation")
         mapping(residuals, "The residuals")
-        for what, chosen in (("weights", weights), ("wishes", toward)):
-            if chosen is not None and by != "actuators":
-                raise SpecificationError(
-                    f"The program with by={by!r} has {what}.",
-                    "Weights and wishes choose among actuators.",
-                    do=f"Remove the {what}, or write by='actuators'.",
-                    by=by,
-                )
+        chosen = [name for name, value in (("weights", weights), ("toward", toward)) if value is not None]
+        without_effect(chosen if by != "actuators" else [], f"with by={by!r}: they choose among actuators")
         self.with_turns = {name: _residual(name, value) for name, value in residuals.items()}
         self.residuals = {name: without_turns(value) for name, value in self.with_turns.items()}
         self.by = by
@@ -126,13 +115,7 @@ class Program(Packed):
             If the factor is not positive, or the kinematics q' = V w + h depend on time or drift by h.
         """
         require_kind(Coordinates, "q", q, "sv.coordinates(...)")
-        sigma, instant = _as_float(factor), _as_float(at)
-        if not sigma > 0:
-            raise SpecificationError(
-                f"factor={factor!r}.", "The factor is positive; 2.0 takes twice as long.", factor=factor
-            )
-        if np.isnan(instant):
-            raise SpecificationError(f"at={at!r}.", "The fixed instant is a finite number [s].", at=at)
+        sigma, instant = positive("factor", factor), finite("at", at, "instant")
         if not q.plain and (not q.h.is_zero() or ca.depends_on(q.V, q.t)):
             raise SpecificationError(
                 "The kinematics q' = V w + h depend on time or drift by h.",
@@ -176,61 +159,26 @@ def no_program():
 def _residual(name, value):
     if isinstance(value, (bool, str)) or (isinstance(value, np.ndarray) and value.dtype != object):
         value = [value]
-    items = column(value, f"residual {name!r}")
-    if len(items) != 1:
+    (residual,) = settled(column(value, f"The residual {name!r}", 1))
+    if not ca.symvar(residual):
         raise SpecificationError(
-            f"The residual {name!r} has {len(items)} entries.",
-            "A residual is a scalar.",
-            do="Name each component.",
-            name=name,
-            entries=len(items),
-        )
-    items = settled(items)
-    if not ca.symvar(items[0]):
-        raise SpecificationError(
-            f"The residual {name!r} is the number {items[0]}.",
+            f"The residual {name!r} is the number {residual}.",
             "A residual is an expression of the coordinates, their derivatives and t.",
             do="Write the expression that the motion keeps at zero.",
             name=name,
         )
-    return items[0]
+    return residual
 
 
 def _weight(name, value):
     if isinstance(value, ca.SX):
-        items = column(value, f"the weight of {name!r}", 1)
-        if ca.symvar(items[0]):
-            return items[0]
-    number = _as_float(value)
-    if not number > 0:
-        raise SpecificationError(
-            f"The weight of {name!r} is {value!r}.",
-            "The actuation of least uᵀWu exists for positive weights.",
-            do="Use a positive number or an expression; the default is 1.",
-            name=name,
-            weight=value,
-        )
-    return number
+        (weight,) = column(value, f"The weight of {name!r}", 1)
+        if ca.symvar(weight):
+            return weight
+    return within(name, value, above=0.0, given=f"The weight of {name!r} is {value!r}.")
 
 
 def _wish(name, value):
     if isinstance(value, ca.SX):
-        return column(value, f"the wish of {name!r}", 1)[0]
-    number = _as_float(value)
-    if np.isnan(number):
-        raise SpecificationError(
-            f"The wish of {name!r} is {value!r}.",
-            "A wish is an actuation: an expression of t, q and γ', or a number.",
-            do="Use an expression or a number; the default is 0.",
-            name=name,
-            wish=value,
-        )
-    return number
-
-
-def _as_float(value):
-    """A finite number, or NaN for anything else."""
-    try:
-        return finite("value", value)
-    except SpecificationError:
-        return np.nan
+        return column(value, f"The wish of {name!r}", 1)[0]
+    return finite(name, value, "wish")

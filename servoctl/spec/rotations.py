@@ -9,7 +9,7 @@ With a time law from `servoctl.paths` as the argument they are orientations to b
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_numbers, column, matrix
+from servoctl.checks import array_of, column, matrix
 from servoctl.errors import SpecificationError
 from servoctl.spec import paths
 
@@ -39,11 +39,9 @@ def turn(angle, axis, start=None):
         If the axis is zero or the start is no rotation.
     """
     (angle,) = column(angle, "the angle", 1)
-    axis = as_numbers(axis)
-    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
-        raise SpecificationError(
-            f"The axis of the turn is {axis.tolist()}.", "It has three numbers, not all zero.", axis=axis.tolist()
-        )
+    axis = array_of("axis", axis, 3)
+    if not axis.any():
+        raise SpecificationError("The axis of the turn is zero.", "An axis has a direction.", axis=axis.tolist())
     return _about(axis / np.linalg.norm(axis), angle) @ (ca.SX.eye(3) if start is None else as_rotation(start, "start"))
 
 
@@ -165,9 +163,7 @@ def as_rotation(value, what):
     SpecificationError
         If it has another shape, or numbers that are no rotation.
     """
-    value = matrix(value, what)
-    if value.shape != (3, 3):
-        raise SpecificationError(f"{what} has the shape {value.shape}.", "A rotation is (3, 3).", shape=value.shape)
+    value = matrix(value, what, (3, 3))
     if value.is_constant():
         _matrix_of_numbers(np.array(ca.evalf(value)), what)
     return value
@@ -195,9 +191,8 @@ def _axis_and_angle(rotation, what="start and end"):
 
 def _matrix_of_numbers(value, what):
     """A rotation of numbers, (3, 3) array."""
-    array = as_numbers(value)
-    proper = array.shape == (3, 3) and np.isfinite(array).all() and np.linalg.det(array) > 0.0
-    if not proper or np.abs(array.T @ array - np.eye(3)).max() > ORTHONORMAL:
+    array = array_of(what, value, 3, 3)
+    if not np.linalg.det(array) > 0.0 or np.abs(array.T @ array - np.eye(3)).max() > ORTHONORMAL:
         raise SpecificationError(
             f"{what} is no rotation: {array.tolist()}."[:300],
             "A rotation matrix has orthonormal columns and determinant 1.",

@@ -12,14 +12,12 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, mapping
+from servoctl.checks import as_list, column, mapping
 from servoctl.errors import SpecificationError
-from servoctl.values import Identity
+from servoctl.values import Identity, evenly
 
 __all__ = ["box", "disc", "spring"]
 
-SEQUENCE = "A shape is a sequence of points, all (x, y) or all (x, y, z)."
-EXAMPLE = 'Write "rope": [(x, 0), (X, -Z)].'
 CORNERS = 24  # of a disc
 EARLY, LATE = 0.15, 0.85  # parts of a spring between which it has coils
 INSTANTS = 9  # of a motion, at which the direction of gravity is examined
@@ -102,33 +100,21 @@ def _point(point):
 
 def as_shapes(shapes, known):
     """Shapes by name as (d, n) SX of n points; `known(expression, what, size)` checks the symbols of an expression."""
-    placed = {}
+    placed, size = {}, (2, 3)
     for name, points in mapping(shapes, "The shapes").items():
         what = f"The shape {name!r}"
-        if not isinstance(points, (list, tuple, np.ndarray)):
+        points, entries = as_list(points), []
+        if not points:
             raise SpecificationError(
-                f"{what} is a {type(points).__name__}.", SEQUENCE, do=EXAMPLE, name=name, type=type(points).__name__
-            )
-        columns = [column(point, f"{what}, point {i},") for i, point in enumerate(points, 1)]
-        sizes = sorted({len(point) for point in columns})
-        if len(sizes) != 1 or sizes[0] not in (2, 3):
-            raise SpecificationError(
-                f"{what} has points of {' and '.join(map(str, sizes))} numbers." if sizes else f"{what} is empty.",
-                SEQUENCE,
-                do=EXAMPLE,
+                f"{what} has no points.",
+                "A shape is a sequence of points, all (x, y) or all (x, y, z).",
+                do='Write "rope": [(x, 0), (X, -Z)].',
                 name=name,
-                sizes=sizes,
             )
-        entries = [e for point in columns for e in point]
-        placed[name] = ca.reshape(known(entries, what, len(entries)), sizes[0], len(columns))
-    sizes = {name: points.shape[0] for name, points in placed.items()}
-    if len(set(sizes.values())) > 1:
-        raise SpecificationError(
-            f"The shapes {', '.join(sizes)} have points of {', '.join(map(str, sizes.values()))} numbers.",
-            "All shapes of a mechanism lie in one plane, or in space.",
-            do="Give every point a third number, its height.",
-            sizes=sizes,
-        )
+        for i, point in enumerate(points, 1):
+            entries += column(point, f"{what}, point {i},", *size)
+            size = size if len(size) == 1 else (len(entries),)  # of all that follow: they lie in one plane, or in space
+        placed[name] = ca.reshape(known(entries, what, len(entries)), *size, -1)
     return placed
 
 
@@ -160,7 +146,7 @@ def heights(mechanism, names, t, q, p):
     own = dict(zip(mechanism.q.names, mechanism.q, strict=True)) | mechanism.outputs
     if any(mechanism.q.order(own[name]) > 0 for name in names):
         return [0] * len(names)
-    chosen = np.unique(np.linspace(0, len(t) - 1, INSTANTS).astype(int))
+    chosen = evenly(len(t), INSTANTS)
     system = mechanism.q
     rates = ca.vertcat(*system.gamma(1), *system.gamma(2))
     symbols = [system.t, ca.vertcat(*system), rates, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)]
