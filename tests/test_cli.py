@@ -608,7 +608,7 @@ LONG = "n" * 300
         ["report", LONG], ["report", "a\0b"], ["export-c", "overhead-crane", "--out", LONG],
         ["export-c", "overhead-crane", "--out", "a\0b"],
         *(["run", "overhead-crane", "--out", out] for out in (LONG, "a\0b", "\ud800", f"{LONG}/{LONG}")),
-        ["run", "overhead-crane", "--out", "a\0b"],
+        *([command, "overhead-crane", "--out", "a\0b"] for command in ("tradeoff", "run")),
     ],
     ids=lambda argv: " ".join(word[:12] for word in argv).encode("ascii", "backslashreplace").decode(),
 )  # fmt: skip

@@ -1,6 +1,7 @@
 """The measured trade: every candidate has its row, the numbers are those of a run, and the advice follows from them."""
 
 import csv
+import json
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from servoctl.gallery import gallery
 from servoctl.methods.accuracy import motion_error
 from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.methods.choice import as_method
+from servoctl.shell.main import main
 from servoctl.study.load import load
 from servoctl.study.table import Study
 from servoctl.study.tradeoff import TOLERANCES as DEFAULTS
@@ -302,3 +304,35 @@ def test_a_figure_of_failures_only_says_so(scene, tmp_path):
 
 def test_every_method_has_its_own_colour():
     assert len(set(COLOURS)) == len(COLOURS) >= len(ALL_METHODS) - 1  # bounded is not measured
+
+
+# --- the command
+
+
+def test_the_command_leaves_table_figure_and_advice(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = "tradeoff appell-hamel --t-span 0 0.5 --method Taylor RK4 --drift none --set b=0.21"
+    assert main([*line.split(), "--error", "1e-6"]) == 0
+    folder = tmp_path / "servoctl-runs" / "appell-hamel-tradeoff"
+    names = {"tradeoff.npz", "tradeoff.csv", "tradeoff.png", "summary.json", "report.txt"}
+    assert {path.name for path in folder.iterdir()} == names
+    facts = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert facts["t_span"] == [0.0, 0.5] and facts["recommended"]["method"] in ("Taylor", "RK4")
+    assert "Recommended: method=" in capsys.readouterr().out
+    assert set(load(folder / "tradeoff.npz")["method"]) == {"Taylor", "RK4"}
+
+
+def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = "tradeoff appell-hamel --t-span 0 0.5 --method RK4 --drift none --out here --seconds 1e-9"
+    assert main(line.split()) == 2
+    assert "seconds=1e-09 was given" in capsys.readouterr().err
+    assert (tmp_path / "here" / "tradeoff.csv").exists() and (tmp_path / "here" / "report.txt").exists()
+
+
+@pytest.mark.parametrize("option", ["--limit", "--error", "--seconds"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "x"])
+def test_the_command_refuses_what_is_no_positive_number_before_it_measures(option, value, capsys):
+    with pytest.raises(SystemExit):
+        main(["tradeoff", "appell-hamel", f"{option}={value}"])
+    assert "not a positive number" in capsys.readouterr().err

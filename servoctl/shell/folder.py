@@ -99,9 +99,9 @@ def _nowhere(path, error):
     )
 
 
-def folder_of(args, name):
-    """The folder of --out, by default servoctl-runs/NAME."""
-    return Folder(Path("servoctl-runs", name) if args.out is None else as_path(args.out, "--out"), name)
+def folder_of(args, name, ending=""):
+    """The folder of --out, by default servoctl-runs/NAME with the ending."""
+    return Folder(Path("servoctl-runs", name + ending) if args.out is None else as_path(args.out, "--out"), name)
 
 
 def summary(run, start, verification):

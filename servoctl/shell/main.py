@@ -15,6 +15,7 @@ COMMANDS = {  # name: module, its function that adds the arguments, help
     "list": ("listing", "add_list", "the gallery's scenes"),
     "report": ("report", "add_report", "the derivation of a model, its structure, its verdict; no simulation"),
     "run": ("run", "add_run", "derive, simulate, verify; write figures and numbers to a folder"),
+    "tradeoff": ("tradeoff", "add_tradeoff", "measure errors and costs of methods and treatments of drift"),
     "export-c": ("export", "add_export", "the feedforward and residuals of a scene as one C file and header"),
     "cache": ("cache", "add_cache", "where compiled code and derivations are kept on disk, and how much"),
     "versions": ("versions", "add_versions", "versions, system and compiler, to paste into a report of a fault"),
