@@ -31,6 +31,11 @@ from servoctl.values import frozen
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
 BELOW = 1e-6  # of a limit: distance that the fastest time law keeps from it
 TIGHTENED, TIGHTER = 5, 1.2  # how often a time-optimal law is solved; limits at nodes give way by this many excesses
+CURVE_GROWS = (
+    "curve",
+    "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
+    "Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
+)  # where errors grow, the rule, and what to do
 REACHED = 1e-4  # of a limit: largest distance at which it counts as reached
 
 
@@ -178,12 +183,7 @@ def _optimal(scene, bar):
         found = scene.tried(curve.program_along(step), factor)
         bar.update()
         if found[-1] is not None and not found[-1].model.flat:
-            require_no_growth(
-                found[-1],
-                "curve",
-                "A time-optimal law by the exact inverse is for programs that are flat or minimum phase.",
-                "Use sv.relaxed(plant, program, t_span, limits=...) for a given duration, or choose another output.",
-            )
+            require_no_growth(found[-1], *CURVE_GROWS)
         return found
 
     _, slow = _bracket(attempt)

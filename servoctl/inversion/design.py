@@ -43,7 +43,7 @@ QUADRATIC_PROGRAMS = 200  # of sequential quadratic programming
 UNCHANGED = 1e-12  # change of the cost, relative to that before, with which sequential quadratic programming ends
 ACTIVE = 1e-5  # distance from an inequality, relative to the limit, within which it counts as met
 STATIONARY = 1e-4  # of the cost: largest gain across the ranges at a local minimum
-GROWS = (
+MOTION_GROWS = (
     "motion",
     "A design is one of exact inverses: flat, bounded, or integrated forward where errors do not grow.",
     "Begin and end the program with a dwell, or choose another output.",
@@ -271,7 +271,7 @@ class Motions:
         first = self.run(model)
         self.guess = dict(zip(model.state_names, np.asarray(first.start.values).tolist(), strict=False))
         if not model.flat and self.method is None:
-            require_no_growth(first, *GROWS)
+            require_no_growth(first, *MOTION_GROWS)
             free = sensitivity(first, model.state_names[0], names).independent
             self.held = {name: self.guess[name] for name in free}
         self.t1 = float(self.ends(self.numbers)[0])
@@ -432,7 +432,7 @@ class Search:
         """The result for the unknowns of a minimum, with its plan."""
         values = dict(zip(self.motions.names, self.parameters(v).tolist(), strict=True))
         if not plan.model.flat and self.motions.method is None:
-            require_no_growth(plan, *GROWS)
+            require_no_growth(plan, *MOTION_GROWS)
             plan = judged(plan)
         limits = [(name, side) for excess, name, side, *_ in excesses(plan, self.limits) if abs(excess) <= REACHED]
         at_ends = [

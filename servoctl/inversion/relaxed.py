@@ -58,7 +58,7 @@ DEFECT, AIM = 1e-7, 0.1  # of the states between nodes, relative to their sizes;
 PLACES = (0.12, 0.4, 0.75)  # places within an interval where the defect is measured
 ROUNDS, MOST_PIECES, MOST_INTERVALS = 6, 8, 400  # of the mesh; pieces of an interval; intervals
 SAMPLES = 1000  # of the run, at least
-OPEN = (-np.inf, np.inf)
+UNLIMITED = (-np.inf, np.inf)
 
 
 def relaxed(
@@ -155,7 +155,7 @@ def _all_limits(plant, limits):
     known = dict(plant.limits) | {f"d{name}": (-rate, rate) for name, rate in plant.rate_limits.items()}
     names = [*plant.inputs, *(f"d{name}" for name in plant.inputs)]
     for name, value in by_name(limits, names, "actuator or rate", "The limits").items():
-        (low, high), before = interval(name, value, "limit"), known.get(name, OPEN)
+        (low, high), before = interval(name, value, "limit"), known.get(name, UNLIMITED)
         known[name] = max(low, before[0]), min(high, before[1])
         if not known[name][0] < known[name][1]:
             raise SpecificationError(
@@ -286,12 +286,12 @@ class Relaxation(Transfer):
     def _sides(self, plan):
         """Sides of the states, of the control points, and of the constraints that have some, by kind."""
         inputs, (_, u_size, size, _) = self.plant.inputs, self.sizes
-        x, count = _sides([OPEN] * self.n, plan.x.shape[1]), plan.points.shape[1]
+        x, count = _sides([UNLIMITED] * self.n, plan.x.shape[1]), plan.points.shape[1]
         if self.opening is None:
             x[:, :, 0] = self.begin
         fixed = np.isfinite(self.target[0])
         x[:, fixed, -1] = self.target[0][fixed]
-        u = _sides([self.limits.get(name, OPEN) for name in inputs], count)
+        u = _sides([self.limits.get(name, UNLIMITED) for name in inputs], count)
         rates = [f"d{name}" for name in inputs]
         limited = np.array([rate in self.limits for rate in rates])  # which do not jump
         if self.held is not None:
@@ -301,8 +301,8 @@ class Relaxation(Transfer):
         return {
             "x": x,
             "u": u,
-            "begin": _sides(np.where(limited[:, None], OPEN, 0.0), 1),
-            "slope": _sides([self.limits.get(name, OPEN) for name in rates], count - 1) / u_size[:, None],
+            "begin": _sides(np.where(limited[:, None], UNLIMITED, 0.0), 1),
+            "slope": _sides([self.limits.get(name, UNLIMITED) for name in rates], count - 1) / u_size[:, None],
             "bound": _sides(self.bounds.values(), WATCHED * len(plan.pieces.h)) / size[:, None],
         }
 
@@ -324,7 +324,7 @@ class Relaxation(Transfer):
         facts = {"status": stats["return_status"], "weights": beta.tolist()}
         limits = self.limits | self.bounds
         free = copy(self)
-        free.limits, free.bounds = {}, dict.fromkeys(self.bounds, OPEN)
+        free.limits, free.bounds = {}, dict.fromkeys(self.bounds, UNLIMITED)
         w, without = nlp.solve(nlp.joined(plan.x, plan.points), beta, free._sides(plan)) if limits else (None, stats)
         if words(without):
             return IntegrationStopped(
