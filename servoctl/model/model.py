@@ -38,7 +38,6 @@ from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
 from servoctl.reduction.ranks import alive
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
-from servoctl.reduction.samples import warn_of_samples
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
@@ -91,14 +90,12 @@ def derive(
     Warns
     -----
     RuntimeWarning
-        For a residual that is a product and vanishes about the guess by more than one of its factors, and for splines
-        whose samples do not determine a derivative of the path that the actuation contains.
+        For a residual that is a product and vanishes about the guess by more than one of its factors.
     """
     require_parts(mechanism, program, guess)
     model = derived(needed(mechanism, program, keep, guess or {}), program, guess)
     r = model.reduction
     warn_of_products(r)
-    warn_of_samples(r.switches, model.parameters, r.smoothness, r.knots.times)
     return model
 
 
