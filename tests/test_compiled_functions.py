@@ -132,12 +132,12 @@ def test_operations_on_many_points_at_once_have_the_bits_of_single_points(with_c
         evaluator = Interpreter(g)
         for k in range(n):
             once[:, k] = evaluator._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
-        while "_lanes" not in vars(evaluator):
+        while "_machine" not in vars(evaluator):
             evaluator.grid(t, x, p, again)
         again[:] = np.inf
         evaluator.grid(t, x, p, again)
         by_operations = with_compiler and not contains(g, ca.OP_ERFINV)
-        assert isinstance(evaluator._lanes, Machine) == by_operations
+        assert isinstance(evaluator._machine, Machine) == by_operations
         np.testing.assert_array_equal(again, once)
         zeros = once == 0
         np.testing.assert_array_equal(np.signbit(again[zeros]), np.signbit(once[zeros]))
@@ -149,7 +149,7 @@ def test_a_function_is_written_for_many_points_at_once_when_many_were_evaluated(
     made = []
     for _ in range(3):
         evaluator.grid(t, x, p, y)
-        made.append("_lanes" in vars(evaluator))
+        made.append("_machine" in vars(evaluator))
     assert made == [False, True, True]
 
 

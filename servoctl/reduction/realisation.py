@@ -15,7 +15,7 @@ import numpy as np
 
 from servoctl.errors import NotRealisable, SingularProgram, SpecificationError
 from servoctl.jets.branches import cse
-from servoctl.reduction.appell import Realisation, plant_accelerations
+from servoctl.reduction.appell import Realisation, plant_solution
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each
 from servoctl.reduction.rows import balances, settle_alone
@@ -163,7 +163,7 @@ def _determined_rows(mechanism, rows, material, points, k):
 def _responses(mechanism, material, points):
     """N = ∂γ''/∂u of the plant, (n, m) SX: M⁻¹E, or beside material rows T_m(T_mᵀMT_m)⁻¹T_mᵀE."""
     still = ca.SX.zeros(len(material), mechanism.E.shape[1])
-    return plant_accelerations(mechanism, material, mechanism.E, still, points)[0]
+    return plant_solution(mechanism, material, mechanism.E, still, points)[0][: mechanism.q.n, :]
 
 
 def _independent_actuators(mechanism, material, points):

@@ -220,12 +220,8 @@ def _by_points(mechanism, program, switches, balance, context):
     ]
     constraints, points, of_constraints = _constraints(mechanism, program, original, context)
     realised, points, of_sharing = realisation(mechanism, program, constraints, points, context)
-    for split in realised.splits():
-        dynamics, of_split = split.dynamics(balance)
-        dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
-        if not any(_contradicts(row, points) for row in dynamics):
-            realised = split
-            break
+    dynamics, of_split = realised.dynamics(balance)
+    dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
     _require_motion(dynamics, program)
     rows = [*(realised.settled or constraints), *dynamics]
     solve = complete if realised.settled else completed
@@ -327,14 +323,6 @@ def _constraints(mechanism, program, original, context):
         # Hidden constraints among these rows follow with those of (3.18); here they only show contradictions.
         complete(q, constraints, context, points)
     return constraints, points, pivots
-
-
-def _contradicts(row, points):
-    """Whether a row depends on t alone and is not zero.
-
-    It may have been divided by a jet that is zero in every motion, which is a factor of it with another split.
-    """
-    return row.order < 0 and bool(np.any(clean(*points.evaluate([row.expression]))))
 
 
 def _require_motion(dynamics, program):
