@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
-from test_zeros import BLENDS, eccentric, inertia
+from test_zeros import BLENDS, eccentric
 
 import servoctl as sv
 from servoctl.errors import IntegrationStopped
@@ -12,7 +12,6 @@ from servoctl.gallery import gallery
 from servoctl.jets import algebra
 from servoctl.methods import dropped
 from servoctl.model.model import Model
-from servoctl.plants.equations import PlantEquations
 from servoctl.reduction import ranks
 
 FIELDS = ("tanh in time", "bump in time", "cam with dwell", "fabs in place", "tanh in place", "root in place")
@@ -34,15 +33,6 @@ def machine(name, dwell=1.0):
     return sv.Mechanism(q, kinetic=kinetic, potential=x**2 / 20, parameters=p, actuators={"F": x, "G": y})
 
 
-def law(t, y):
-    return {"F": 0.3 * np.sin(t), "G": 0.2}
-
-
-def loop(name):
-    start, timing = [1.0, 0.0, 1.5, 0.4], sv.Timing(rate=50.0)
-    return sv.close(sv.plant(machine(name)), law, start, SPAN, timing=timing)
-
-
 def motion(name, method):
     plant = sv.plant(machine(name))
     return sv.simulate(plant, [1.0, 0.0, 1.5, 0.4], SPAN, method, inputs={"F": lambda t: 0.3 * ca.sin(t), "G": 0.2})
@@ -57,10 +47,10 @@ def ideal(name):
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_motions_and_loops_have_the_entries_that_come_alive(name, forgetful):
-    right = [ideal(name)["x"], motion(name, "DOP853")["y"], loop(name).states]
+def test_motions_have_the_entries_that_come_alive(name, forgetful):
+    right = [ideal(name)["x"], motion(name, "DOP853")["y"]]
     forgetful()
-    for one, other in zip(right, [ideal(name)["x"], motion(name, "DOP853")["y"], loop(name).states], strict=True):
+    for one, other in zip(right, [ideal(name)["x"], motion(name, "DOP853")["y"]], strict=True):
         assert other == pytest.approx(one, abs=1e-8)
 
 
@@ -78,24 +68,8 @@ def test_without_the_net_the_motion_is_another_one(forgetful, monkeypatch):
     assert np.abs(motion("tanh in place", "DOP853")["y"] - right).max() > 1e-3
 
 
-def test_many_loops_are_those_of_equations_with_all_entries(forgetful):
-    def closed():
-        plan = sv.simulate(sv.plant(machine("cam with dwell")), [1.0, 0.0, 0.4, 0.1], (0.0, 1.0), inputs={"F": 0.1})
-        plant = sv.plant(machine("cam with dwell"))
-        run = sv.close(plant, sv.feedforward(plan, plant, rate=50.0), [1.0, 0.0, 0.4, 0.1], (0.0, 1.0))
-        return sv.close_many(run, {"x": [1.0, 1.8, 2.5], "dx": [0.4, 0.9, 0.2]})
-
-    right = closed()
-    forgetful()
-    other = closed()
-    for column in ("final x", "final y", "max |dy|"):
-        assert other[column] == pytest.approx(right[column], abs=1e-9)
-
-
 def test_numbers_decide_again_what_is_dropped(forgetful):
     forgetful()
-    plant = sv.plant(eccentric()[0], e=0.2)
-    assert plant.rates(0.3, [0.1, 0.7, 0.3, 0.4], [1.0, 2.0])[2:] == pytest.approx(inertia(0.2, 0.7, 0.4, [1, 2]))
     mechanism, program = eccentric()
     model = sv.derive(mechanism, program).with_parameters(e=0.2)
     run = sv.simulate(model, model.start(), (0.0, 1.0))
@@ -103,17 +77,13 @@ def test_numbers_decide_again_what_is_dropped(forgetful):
     assert run["F"] == pytest.approx(sv.simulate(own, own.start(), (0.0, 1.0))["F"], abs=1e-9)
 
 
-def test_what_no_derivation_includes_ends_motion_and_loop(forgetful, monkeypatch):
+def test_what_no_derivation_includes_ends_the_motion(forgetful, monkeypatch):
     forgetful()
     monkeypatch.setattr(Model, "near", lambda model, t, jets, sizes=(): model)
     with refused(IntegrationStopped) as caught:
         motion("tanh in place", "DOP853")
     run = caught.value.run
     assert not run.success and run.t[-1] < caught.value.details["t"] < SPAN[1]
-    monkeypatch.setattr(PlantEquations, "near", lambda equations, t, x, values: equations)
-    with refused(IntegrationStopped) as caught:
-        loop("tanh in place")
-    assert not caught.value.run.success
 
 
 @pytest.mark.parametrize("name", gallery)

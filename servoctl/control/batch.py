@@ -28,8 +28,7 @@ class Unit:
     """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
     `table` maps t_k and row k of the schedule to values that are common to all cases at a sample. `states`, `inputs`
-    and `residuals` (Residuals or None) are gathered; `n_y` is the number of measurements. Behind these comes, if
-    `watched` is 1, the largest share of its terms that an entry left out by eliminations has.
+    and `residuals` (Residuals or None) are gathered; `n_y` is the number of measurements.
     """
 
     text: str
@@ -38,7 +37,6 @@ class Unit:
     inputs: tuple
     residuals: object
     n_y: int
-    watched: int
 
     @property
     def names(self):
@@ -101,23 +99,18 @@ def _derived(plant, law, disturbed, residuals):
         emit.include("batch.c"),
     ]
     table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
-    text, watched = "".join(parts), int(plant.equations.dropped is not None)
     table = compiled(table, "table")
-    return Unit(text, table, plant.state_names, plant.inputs, residuals, len(law.measures), watched)
+    return Unit("".join(parts), table, plant.state_names, plant.inputs, residuals, len(law.measures))
 
 
 def _signals(plant, residuals, t, x, p):
-    """Residuals, and the largest share of its terms that an entry left out by eliminations has."""
-    phi, entries = ca.SX(0, 1), plant.equations.dropped
-    if residuals:
-        places = [plant.mechanism.parameters.names.index(name) for name in residuals.parameter_names]
-        # a single parameter indexed by [] is a row in CasADi, not a column
-        numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in places))
-        phi = residuals.expression(t, x, plant.state_names, numbers)
-    if entries is not None:
-        values, sizes = ca.vertsplit(ca.fabs(entries.expression(t, x, p)), entries.n_y // 2)
-        phi = ca.vertcat(phi, ca.mmax(ca.if_else(sizes > 0, values / sizes, 0)))
-    return phi
+    """Residuals of the state x at t."""
+    if not residuals:
+        return ca.SX(0, 1)
+    places = [plant.mechanism.parameters.names.index(name) for name in residuals.parameter_names]
+    # a single parameter indexed by [] is a row in CasADi, not a column
+    numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in places))
+    return residuals.expression(t, x, plant.state_names, numbers)
 
 
 def _law_in_c(law):
@@ -211,7 +204,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, s
     if native is None:
         return None
     native.restype = None
-    count, width, size = cases[1].shape[1], VECTORS * n, len(unit.names) + unit.watched
+    count, width, size = cases[1].shape[1], VECTORS * n, len(unit.names)
     blocks = -(-count // width)
     columns = np.minimum(np.arange(blocks * width), count - 1)
     gathered = np.full((2 + 3 * size, blocks * width), np.nan)

@@ -14,7 +14,6 @@ from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, L
 from servoctl.control.reference import Reference, of_plan, require_plan, require_plant, resampled
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
-from servoctl.methods.dropped import DERIVATIONS, came_alive, first_alive
 from servoctl.plants.plant import Plant
 from servoctl.reduction.orders import other_order
 from servoctl.run import Run
@@ -89,14 +88,8 @@ def close(
     if plan is not None:
         require_plan(plan, plant)
     plan = law.plan if plan is None else plan
-    for _ in range(DERIVATIONS):
-        plant = regular_at_start(plant, t_span[0], x0)
-        run = finished(plant, law, plan, loop_of(plant, law, x0, t_span, conditions), conditions)
-        t, equations = _derived_along(run)
-        if equations is None:
-            return run
-        plant = replace(plant, equations=equations)
-    raise _stopped_at(run, came_alive(t))
+    plant = regular_at_start(plant, t_span[0], x0)
+    return finished(plant, law, plan, loop_of(plant, law, x0, t_span, conditions), conditions)
 
 
 def regular_at_start(plant, t0, x0):
@@ -106,23 +99,6 @@ def regular_at_start(plant, t0, x0):
     rest = np.zeros(len(plant.inputs))
     x = _initial_state(plant, t0, x0, rest)
     return plant if np.isfinite(plant.rates(t0, x, rest)).all() else plant.near(t0, x)
-
-
-def _derived_along(run):
-    """The instant at which an entry that eliminations left out comes alive, and equations derived near it; or None."""
-    plant, equations, t, x = run.plant, run.plant.equations, run.t, run.states
-    if equations.dropped is None:
-        return None, None
-    values = plant.parameters[: len(equations.values)]
-
-    def entries(some):
-        return equations.entries_dropped, equations.points_at(t[some], x[:, some], values)
-
-    found = first_alive(equations.dropped, entries, t, x, plant.p())
-    if found is None:
-        return None, None
-    first, clearest = found
-    return float(t[first]), equations.near(float(t[clearest]), x[:, clearest], values)
 
 
 def _of_start(plant, plan, x0):
@@ -261,13 +237,9 @@ def _of_same_orders(run):
     k, row = equations.orders.first_change(run.t, states, values)
     if k is None:
         return run
-    raise _stopped_at(run, other_order(row, float(run.t[k])))
-
-
-def _stopped_at(run, error):
-    """The error that stops a loop, with the run."""
+    error = other_order(row, float(run.t[k]))
     error.run = replace(run, success=False, status=-1, message=f"stopped: {str(error).split('. ')[0]}")
-    return error
+    raise error
 
 
 def _stopped(law, loop, status, end):

@@ -8,16 +8,14 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.folding import folded
-from servoctl.codegen.function import compiled
 from servoctl.codegen.interpreted import Interpreter
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import cse, size_of_terms
+from servoctl.jets.branches import cse
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context, sample
 from servoctl.reduction.orders import Orders
-from servoctl.reduction.ranks import SUSPECT, alive, noting_dropped
 from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, strong
 from servoctl.reduction.rows import as_rows
 from servoctl.values import Identity
@@ -60,19 +58,13 @@ class PlantEquations:
         f = ca.Function(name, inputs, [ca.densify(cse(ca.vertcat(*outputs)))])
         return ca.Function(name, f.sx_in(), [ca.densify(cse(folded(f)))], ["t", "x", "p"], ["y"])
 
-    @property
+    @cached_property
     def _material(self):
         """Rows of the material constraints, which have full rank, and points of their manifold."""
-        return self._rows[:2]
-
-    @cached_property
-    def _rows(self):
-        """The same, and what eliminations left out."""
         m, context = self.mechanism, self._context
-        with noting_dropped() as entries:
-            rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
+        rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
         require_inertia(m, rows, points)
-        return rows, points, entries
+        return rows, points
 
     @cached_property
     def _context(self):
@@ -87,25 +79,6 @@ class PlantEquations:
         window = t - NEARBY, t + NEARBY
         again._context = Context(self.mechanism.parameters.symbols, again.values, window, state, NEAR_SPREAD)
         return again
-
-    def points_at(self, t, x, values):
-        """Points at times t (N,) and states x (n_x, N)."""
-        return self._material[1].at(t, x[: self.q.nq + self.q.n], np.asarray(values))
-
-    @cached_property
-    def entries_dropped(self):
-        """What eliminations left out as zero, unless all terms cancel by algebra: a list of SX."""
-        from servoctl.jets.algebra import cancels
-
-        return [entry for entry in (*self._rows[2], *self._solved[2]) if not cancels(entry)]
-
-    @cached_property
-    def dropped(self):
-        """These, and the sizes of their terms, compiled, of (t, x, p); None if nothing was left out."""
-        entries = self.entries_dropped
-        if not entries:
-            return None
-        return compiled(self.function("dropped", [*entries, *map(size_of_terms, entries)]), "dropped")
 
     def require_inertia(self, values):
         """Raise SpecificationError if the mass matrix is not positive with parameters (n_p,) or (n_p, N)."""
@@ -179,29 +152,8 @@ class PlantEquations:
             return True
         if self.orders and not all(self.orders.hold(self._points(case)) for case in values.T):
             return False
-        if self.dropped is not None and self._alive(values):
-            return False
-        return bool(strong(self._pivot_sizes(values), self._usual_pivots).all())
-
-    def _alive(self, values):
-        """Whether an entry that was left out is not zero at a point with parameters (n_p, N)."""
-        shares = np.split(np.abs(self._dropped_at_points(values)), 2)
-        suspects = (shares[0] > SUSPECT * shares[1]).any(axis=(0, 2))
-        entries, points = self.entries_dropped, self._material[1]
-        return any(alive(entries, replace(points, values=case)).any() for case in values.T[suspects])
-
-    @cached_property
-    def _dropped_at_points(self):
-        entries = self.entries_dropped
-        return self._at_points(ca.vertcat(*entries, *map(size_of_terms, entries)))
-
-    @cached_property
-    def _usual_pivots(self):
-        return self._pivot_sizes(self.values[:, None])
-
-    def _pivot_sizes(self, values):
-        """Least sizes of the pivots over all points (pivots, N) with parameters (n_p, N)."""
-        return np.abs(self._pivots(values)).min(axis=2, initial=np.inf)
+        here, usual = (np.abs(self._pivots(v)).min(axis=2, initial=np.inf) for v in (values, self.values[:, None]))
+        return bool(strong(here, usual).all())
 
     def _points(self, values):
         """Points of the material constraints with other parameters."""
@@ -243,16 +195,15 @@ class PlantEquations:
 
     @cached_property
     def _solved(self):
-        """[γ''; -λ] from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], the pivots, and what elimination left out."""
+        """[γ''; -λ] from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], and the pivots."""
         q, (rows, points) = self.q, self._material
         acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows]
         second = ca.substitute(ca.vertcat(*second), acceleration, zero) if rows else ca.SX(0, 1)
         driven = self.mechanism.E @ self.force + self.d + self.forces + self.resisting
         force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
-        with noting_dropped() as entries:
-            solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
-        return cse(solution), pivots, entries
+        solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
+        return cse(solution), pivots
 
     @cached_property
     def state_rates(self):

@@ -18,7 +18,6 @@ from servoctl.control.residuals import Residuals
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
-from servoctl.reduction.ranks import SUSPECT
 from servoctl.study.batch import Batch, failure, failures
 from servoctl.study.cases import CASES, as_cases
 from servoctl.study.executor import computed
@@ -91,8 +90,6 @@ def close_many(
     if not run.plant.equations.orders:  # else each loop is judged by itself
         step = run.law.step.native("step") if run.law.allocation else None
         gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads, step)
-        if gathered is not None and derived.watched and np.nan_to_num(gathered.largest[-1]).max() > SUSPECT:
-            gathered = None  # so that `close` judges
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
     meta = {
