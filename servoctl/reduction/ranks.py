@@ -9,9 +9,6 @@ among those of sufficient size at the points, and leaves out entries that vanish
 whose size along a motion shows when the choice has become bad.
 """
 
-from contextlib import contextmanager
-from contextvars import ContextVar
-
 import casadi as ca
 import numpy as np
 
@@ -22,8 +19,6 @@ from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TIN
 from servoctl.values import frozen
 
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
-SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
-_dropped = ContextVar("dropped", default=None)  # where eliminations note what they leave out
 LARGE, THIN = 40, 0.25  # rows and columns of a matrix, and its share of nonzero entries, for sparse elimination
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
@@ -202,25 +197,6 @@ def _difference(a, b):
     return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)
 
 
-@contextmanager
-def noting_dropped():
-    """The list of the entries (SX scalars) that eliminations inside leave out, since they vanish identically."""
-    entries = []
-    token = _dropped.set(entries)
-    try:
-        yield entries
-    finally:
-        _dropped.reset(token)
-
-
-def alive(entries, points):
-    """How many times its rounding an entry that was left out is at each of some points, at least 1, (N,); or 0."""
-    values, sizes = points.evaluate(entries)
-    with np.errstate(all="ignore"):
-        share = np.nan_to_num(np.abs(values) / (ENTRY * sizes), posinf=0.0).max(axis=0, initial=0.0)
-    return np.where(share > 1.0, share, 0.0)
-
-
 def pivot_order(matrix, numbers):
     """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points."""
     n = matrix.shape[0]
@@ -271,9 +247,7 @@ class _System:
         zeros = {(i, j) for (i, j, _), zero in zip(doubtful, vanishing, strict=True) if zero}
         self.rows = [{} for _ in range(n)]
         for i, j, entry in entries:
-            if (i, j) in zeros:
-                _leave_out(entry)
-            else:
+            if (i, j) not in zeros:
                 self.rows[i][j] = entry, scaled[i, j]
         self.rhs = (
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
@@ -344,7 +318,6 @@ class _System:
             old, old_number = row.get(c, (_ZERO, 0.0))
             left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
             if not numbers[: self.points].any() and self._vanishes(left, numbers[self.points :]):
-                _leave_out(left)
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
@@ -373,12 +346,6 @@ _ZERO = ca.SX(0)
 def _vanish(entries):
     """Whether each of some SX scalars vanishes identically."""
     return [vanish(values) for values in spread(entries)] if entries else []
-
-
-def _leave_out(entry):
-    noted = _dropped.get()
-    if noted is not None and not entry.is_zero():
-        noted.append(entry)
 
 
 def _back(value, terms, pivot):
