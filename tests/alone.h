@@ -1,4 +1,4 @@
-/* A unit of small sizes, for editors and compilers that see one file of this folder alone. */
+/* A unit of small sizes, by which each C file of servoctl/codegen/c compiles alone. */
 #define NAME example
 #define NX 4
 #define NP 3
