@@ -231,16 +231,13 @@ class _System:
     """A system under elimination.
 
     `rows` has for each row its entries by column: an SX scalar, and its equilibrated numbers at the points where pivots
-    are chosen. What is zero at all of them is left out if it vanishes identically. Where an elimination asks
-    that, the entries that follow have behind their numbers the values at random points that tell.
-    `candidates` are the columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet,
-    `members` those of a column.
+    are chosen. What is zero at all of them is left out if it vanishes identically. `candidates` are the columns whose
+    entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
     """
 
     def __init__(self, matrix, right, numbers, diagonal=False, in_order=False):
         n, self.diagonal, self.in_order = matrix.shape[0], diagonal, in_order
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
-        self.points, self.asked, self.followed = scaled.shape[2], False, False
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
         doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
         vanishing = _vanish([entry for _, _, entry in doubtful])
@@ -266,7 +263,7 @@ class _System:
             row = {i: row[i]} if i in row else {}
         if not row:
             return []
-        sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
+        sizes = np.abs([number for _, number in row.values()]).min(axis=1).tolist()
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
@@ -275,8 +272,6 @@ class _System:
 
         Among these a number is taken, if there is one: it cannot vanish, and less depends on it.
         """
-        if self.asked and not self.followed:
-            self._follow()
         i, j = pivot or self._pivot()
         row = self.rows[i]
         del self.open[i]
@@ -317,7 +312,7 @@ class _System:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
             left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
-            if not numbers[: self.points].any() and self._vanishes(left, numbers[self.points :]):
+            if not numbers.any() and _vanish([left])[0]:
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
@@ -326,18 +321,6 @@ class _System:
         for k, b in enumerate(pivot_right):
             if not b.is_zero():
                 right[k] = subtract(right[k], multiply(factor, b))
-
-    def _vanishes(self, entry, values):
-        """Whether an entry vanishes identically, from its values at random points if they are followed."""
-        self.asked = True
-        return bool(vanish(values)) if self.followed else _vanish([entry])[0]
-
-    def _follow(self):
-        """Append the values at random points to the numbers of all entries that are still eliminated."""
-        places = [(self.rows[i], j) for i in self.open for j in self.rows[i]]
-        for (row, j), values in zip(places, spread([row[j][0] for row, j in places]), strict=True):
-            row[j] = row[j][0], np.append(row[j][1], values)
-        self.followed = True
 
 
 _ZERO = ca.SX(0)
