@@ -20,7 +20,7 @@ from servoctl.codegen import compiler, emit, native
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
 from servoctl.codegen.interpreted import BLOCK, Interpreter
-from servoctl.errors import NameUnknown, SpecificationError
+from servoctl.errors import SpecificationError
 from servoctl.methods.runge_kutta import tableau
 from servoctl.values import same
 
@@ -407,26 +407,6 @@ def test_threads_do_not_share_memory(backend):
 def test_wrong_arguments_are_refused(call):
     with pytest.raises(SpecificationError):
         call(pendulum(("rk",)))
-
-
-@pytest.mark.parametrize("make", [
-    lambda: compiled(ca.Function("f", [T, X2], [X2]), "f"),
-    lambda: compiled(ca.Function("f", [T, X2, P1], [X2.T]), "f"),
-    lambda: compiled(ca.Function("f", [T, X2, P1], [ca.SX(2, 1)]), "f"),
-    lambda: compiled(function(X2), "not a name"),
-    lambda: compiled(function(X2[0]), "f", ("rk",)),
-    lambda: compiled(function(X2), "f", ("newton",)),
-])
-def test_wrong_functions_are_refused(make):
-    with pytest.raises(SpecificationError):
-        make()
-
-
-def test_an_unknown_loop_is_named():
-    with refused(NameUnknown, name="rk5", match="rk"):
-        compiled(function(X2), "f", ("rk5",))
-    with refused(NameUnknown, name="newtons", match="newton"):
-        compiled(function(X2), "f", ("newtons",))
 
 
 # --- Runge-Kutta
