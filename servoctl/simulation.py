@@ -1,7 +1,6 @@
 """From a model and a start to a run."""
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
@@ -38,7 +37,6 @@ from servoctl.methods.choice import (
     default_method,
     require_combination,
 )
-from servoctl.methods.dropped import DERIVATIONS, alive_along, came_alive
 from servoctl.methods.events import Event, Events, as_events, occurrences
 from servoctl.methods.motion import DEFAULT_SAMPLES, breakpoints, margin_at, without_interruption
 from servoctl.methods.orders import end_at_other_orders
@@ -227,10 +225,10 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:
-        model, motion = _derived_along(model, method, drift, problem, bar)
+        motion = _tolerant(model, method, drift, problem, bar)
     except Unsuited as unsuited:
         method = unsuited.method
-        model, motion = _derived_along(model, method, drift, problem, bar)
+        motion = _tolerant(model, method, drift, problem, bar)
         motion.note = f"by {method}, since {unsuited}"
     finally:
         bar.close()
@@ -342,24 +340,6 @@ def _model_and_start(model, start, inputs):
             type=type(model).__name__,
         )
     return model.including(names_of(start)), start
-
-
-def _derived_along(model, method, drift, problem, bar):
-    """A model and its motion: derived again where an entry comes alive that eliminations left out."""
-    names = model.state_names
-    for _ in range(DERIVATIONS):
-        motion = _tolerant(model, method, drift, problem, bar)
-        t, place = alive_along(motion) or (None, None)
-        if place is None:
-            return model, motion
-        with suppress(ServoError):
-            again = model.near(*place)
-            if again.state_names == names:
-                model = again
-                continue
-        break
-    motion.end_before(t, came_alive(t))
-    return model, motion
 
 
 def _tolerant(model, method, drift, problem, bar):

@@ -258,7 +258,7 @@ def test_a_geometric_path_beside_rolling_is_followed(kind, speed):
 
 
 @pytest.mark.parametrize("expanded", [False, True])
-def test_a_residual_with_a_speed_for_a_factor_is_told_so(expanded):
+def test_a_residual_with_a_speed_for_a_factor_is_refused(expanded):
     q = sv.coordinates("u psi")
     (u, psi), (du, _) = q, q.d(1)
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (u, u**2)) + sv.particle(q, 0.1, psi))
@@ -266,7 +266,7 @@ def test_a_residual_with_a_speed_for_a_factor_is_told_so(expanded):
     times_speed = 2 * du * u * ca.cos(psi) - du * ca.sin(psi) if expanded else du * slip
     speed = du**2 * (1 + 4 * u**2) - 1.0
     for guess in (None, {"du": 1.0}):
-        with refused(SingularProgram, "Divide 'slip' by du", row="slip", factor="du"):
+        with refused(SingularProgram, "'slip'", row="slip"):
             derive(mechanism, sv.Program({"slip": times_speed, "speed": speed}, by="ideal"), guess=guess)
     assert derive(mechanism, sv.Program({"slip": slip, "speed": speed}, by="ideal")).free == 1
 
@@ -299,34 +299,24 @@ def test_the_rate_of_a_constant_heading_of_a_moving_car_holds_its_steering_strai
     assert run["psi"] == pytest.approx(0.3, abs=1e-12) and run["delta"] == pytest.approx(0.0, abs=1e-12)
 
 
-PRODUCTS = {  # residuals a and b of x, y, z and t; the factor of b that a keeps at zero
-    "two residuals": (lambda x, y, z, t: (x - t, (x - t) * (y - ca.sin(t))), "(x-t)"),
-    "in a fraction": (lambda x, y, z, t: (x - t, -2 * (x - t) * (y - t) / (2 + ca.cos(z))), "(x-t)"),
-    "a square": (lambda x, y, z, t: (x - t, (x - t) ** 2 * y), "(x-t)"),
+PRODUCTS = {  # residuals a and b of x, y, their rates and t: a keeps a factor of b at zero
+    "two residuals": lambda x, y, dx, dy, t: (x - t, (x - t) * (y - ca.sin(t))),
+    "in a fraction": lambda x, y, dx, dy, t: (x - t, -2 * (x - t) * (y - t) / (2 + ca.cos(y))),
+    "a square": lambda x, y, dx, dy, t: (x - t, (x - t) ** 2 * y),
+    "a rate that stays": lambda x, y, dx, dy, t: (x - 1.0, dx * (dy - 1.0)),
+    "a rate and a rate": lambda x, y, dx, dy, t: (dx - 1.0, (dx - 1.0) * (dy - ca.sin(t))),
+    "a rate and a coordinate": lambda x, y, dx, dy, t: (x - t, (dx - 1.0) * (y - ca.sin(t))),
 }
 
 
 @pytest.mark.parametrize("name", PRODUCTS)
-def test_a_residual_with_a_factor_that_another_keeps_at_zero_is_told_so(name):
+def test_a_residual_with_a_factor_that_another_keeps_at_zero_is_refused(name):
     q = sv.coordinates("x y z")
-    build, factor = PRODUCTS[name]
-    a, b = build(*q, q.t)
+    a, b = PRODUCTS[name](*list(q)[:2], *q.d(1)[:2], q.t)
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
-    with refused(SpecificationError, f"Divide 'b' by {factor}", row="b", factor=factor):
+    with refused(SpecificationError, "b") as caught:
         derive(mechanism, sv.Program({"a": a, "b": b}, by="ideal"))
-
-
-def test_a_rate_that_another_residual_keeps_at_zero_is_named():
-    q = sv.coordinates("x y u")
-    (_, y, u), (dx, dy, du) = q, q.d(1)
-    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
-    for program, factor in (
-        ({"u": u - 1.0, "slip": du * (dx - 1.0)}, "du"),
-        ({"u": du - 1.0, "slip": (du - 1.0) * (dy - ca.sin(q.t))}, "(du-1)"),
-        ({"u": u - q.t, "slip": (du - 1.0) * (y - ca.sin(q.t))}, "(du-1)"),
-    ):
-        with refused(SpecificationError, "has the factor", row="slip", factor=factor):
-            derive(mechanism, sv.Program(program, by="ideal"))
+    assert "b" in caught.value.details["rows"]
 
 
 @pytest.mark.parametrize("power", [2, 3])
@@ -334,37 +324,35 @@ def test_the_factor_of_a_square_is_named(power):
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
-    with refused(SingularProgram, "Divide 'a' by (x-t)", row="a", factor="(x-t)"):
+    with refused(SingularProgram, "(x-t)", row="a", factor="(x-t)"):
         derive(mechanism, sv.Program({"a": (x - q.t) ** power}, by="ideal"))
 
 
-EXTREMA = {  # residuals of x, y, their rates and t, with an extremum or a kink where they hold; their terms that vanish there
-    "a cosine": (lambda x, y, dx, dy, t: 1 - ca.cos(y - t), ["(y-t)"]),
-    "a cosine of a multiple": (lambda x, y, dx, dy, t: 1 - ca.cos(2 * (y - t)), ["(y-t)"]),
-    "a hyperbolic cosine at zero": (lambda x, y, dx, dy, t: ca.cosh(y) - 1, ["y"]),
-    "an exponential": (lambda x, y, dx, dy, t: ca.exp(y**2) - 1, ["y"]),
-    "a logarithm": (lambda x, y, dx, dy, t: ca.log(1 + (y - t) ** 2), ["(y-t)"]),
-    "a root": (lambda x, y, dx, dy, t: ca.sqrt((y - t) ** 2), ["(y-t)"]),
-    "a distance": (lambda x, y, dx, dy, t: ca.sqrt((x - t) ** 2 + (y - 2) ** 2), ["(x-t)", "(y-2)"]),
-    "a length less a coordinate": (lambda x, y, dx, dy, t: ca.sqrt(1 + (y - t) ** 2) - 1, ["(y-t)"]),
-    "an absolute value": (lambda x, y, dx, dy, t: ca.fabs(y - t), ["(y-t)"]),
-    "a sum of squares": (lambda x, y, dx, dy, t: (x - t) ** 2 + (y - t) ** 2, ["(x-t)", "(y-t)"]),
-    "a curve and a path": (lambda x, y, dx, dy, t: (y - ca.sin(x)) ** 2 + (x - t) ** 2, ["(x-t)", "(y-sin(x))"]),
-    "an inflection": (lambda x, y, dx, dy, t: x - ca.sin(x), ["x"]),
-    "a cosine of a speed": (lambda x, y, dx, dy, t: 1 - ca.cos(dy - 0.5), ["(dy-0.5)"]),
-    "squares of speeds": (lambda x, y, dx, dy, t: (dx - 1) ** 2 + (dy - 1) ** 2, ["(dx-1)", "(dy-1)"]),
-    "a long path": (lambda x, y, dx, dy, t: 1 - ca.cos(y - (t + t**2 + ca.sin(t) + t * ca.cos(3 * t) * ca.exp(t))), ["(y-f(t))"]),
+EXTREMA = {  # residuals of x, y, their rates and t, with an extremum or a kink where they hold
+    "a cosine": lambda x, y, dx, dy, t: 1 - ca.cos(y - t),
+    "a cosine of a multiple": lambda x, y, dx, dy, t: 1 - ca.cos(2 * (y - t)),
+    "a hyperbolic cosine at zero": lambda x, y, dx, dy, t: ca.cosh(y) - 1,
+    "an exponential": lambda x, y, dx, dy, t: ca.exp(y**2) - 1,
+    "a logarithm": lambda x, y, dx, dy, t: ca.log(1 + (y - t) ** 2),
+    "a root": lambda x, y, dx, dy, t: ca.sqrt((y - t) ** 2),
+    "a distance": lambda x, y, dx, dy, t: ca.sqrt((x - t) ** 2 + (y - 2) ** 2),
+    "a length less a coordinate": lambda x, y, dx, dy, t: ca.sqrt(1 + (y - t) ** 2) - 1,
+    "an absolute value": lambda x, y, dx, dy, t: ca.fabs(y - t),
+    "a sum of squares": lambda x, y, dx, dy, t: (x - t) ** 2 + (y - t) ** 2,
+    "a curve and a path": lambda x, y, dx, dy, t: (y - ca.sin(x)) ** 2 + (x - t) ** 2,
+    "an inflection": lambda x, y, dx, dy, t: x - ca.sin(x),
+    "a cosine of a speed": lambda x, y, dx, dy, t: 1 - ca.cos(dy - 0.5),
+    "squares of speeds": lambda x, y, dx, dy, t: (dx - 1) ** 2 + (dy - 1) ** 2,
+    "a long path": lambda x, y, dx, dy, t: 1 - ca.cos(y - (t + t**2 + ca.sin(t) + t * ca.cos(3 * t) * ca.exp(t))),
 }
 
 
 @pytest.mark.parametrize("name", EXTREMA)
-def test_a_residual_without_a_gradient_at_its_solutions_says_which_terms_vanish_there(name):
+def test_a_residual_without_a_gradient_at_its_solutions_is_refused(name):
     q = sv.coordinates("x y")
-    build, terms = EXTREMA[name]
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, tuple(q)))
-    with refused(SingularProgram, "'a'", *terms, row="a") as caught:
-        derive(mechanism, sv.Program({"a": build(*q, *q.d(1), q.t)}, by="ideal"))
-    assert sorted(caught.value.details["zeros"]) == terms
+    with refused(SingularProgram, "'a'", row="a"):
+        derive(mechanism, sv.Program({"a": EXTREMA[name](*q, *q.d(1), q.t)}, by="ideal"))
 
 
 @pytest.mark.parametrize("level", [1e-6, 1e-3, 0.1])

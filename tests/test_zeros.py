@@ -442,3 +442,13 @@ def test_many_loops_whose_constraint_could_change_its_order_are_judged_one_by_on
     assert many.trace["x"][:, 0] == pytest.approx(run["x"], abs=1e-12)
     with refused(SpecificationError):
         sv.close_many(run, {"e": [0.0, 0.3]})
+
+
+@pytest.mark.parametrize("method", ["DOP853", "RadauIIA", "RK4"])
+def test_a_plant_without_constraints_crosses_switches(method):
+    q = sv.coordinates("x y")
+    (x, y), (dx, dy) = q, q.d(1)
+    kinetic = (dx**2 + dy**2) / 2 + 0.3 * ca.tanh(BLENDS["cam with dwell"](q.t, x)) * dx * dy
+    mechanism = sv.Mechanism(q, kinetic=kinetic, potential=x**2 / 20, actuators={"F": x, "G": y})
+    inputs = {"F": lambda t: 0.3 * ca.sin(t), "G": 0.2}
+    assert sv.simulate(sv.plant(mechanism), [1.0, 0.0, 1.5, 0.4], (0.0, 3.0), method, inputs=inputs).success

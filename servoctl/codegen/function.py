@@ -14,10 +14,8 @@ import os
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import named
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.interpreted import BLOCK, Interpreter, restored, restored_grid, weighted
-from servoctl.codegen.loops import LOOPS
 from servoctl.codegen.native import Library, builtin
 from servoctl.codegen.tables import BOUND
 from servoctl.errors import SpecificationError
@@ -28,8 +26,6 @@ CALLS = 10_000  # of one point: CasADi has taken as long as compiling takes then
 FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
 ALONG_A_PATH = "-O2 -fno-tree-pre -fno-tree-vrp -fno-gcse -fno-tree-slp-vectorize"  # Newton: 3/4 of the time of -O3
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
-
-_OUTPUTS_PER_STATE = {"rk": 1, "newton": 3, "taylor": 1}
 
 
 def compiled(f, name, loops=(), project=None, others=None, sizes=None):
@@ -42,51 +38,11 @@ def compiled(f, name, loops=(), project=None, others=None, sizes=None):
     the highest index of coefficients "last", "plain" (1 if q' = γ', else 0), for `whole` "rates" and
     "invariants", the numbers of values of these functions in `others`, and, beside "settled" there, (t, x, p) ->
     (x, γ^(s̄)), "free": 0 for each entry of γ', ..., γ^(s̄-1) that it gives, 1 for those integrated. Raises
-    SpecificationError for a name that is no C identifier, an operation that is not elementary, or too few outputs for a
-    loop, and NameUnknown for an unknown loop.
+    SpecificationError for an operation that is not elementary.
     """
-    _require_columns(f, name)
     for part in filter(None, (f, project, *(others or {}).values())):
         _require_elementary(part)
-    if not (name.isascii() and name.isidentifier()):
-        raise SpecificationError(
-            f"The function is named {name!r}.",
-            "A compiled function has a C identifier as its name.",
-            do="Use letters, digits and underscores.",
-            name=name,
-        )
-    for loop in loops:
-        named(loop, LOOPS, "loop")
-        needed = _OUTPUTS_PER_STATE.get(loop, 0) * f.numel_in(1)
-        if f.numel_out(0) < needed:
-            raise SpecificationError(
-                f"{name!r} has {f.numel_out(0)} outputs for {f.numel_in(1)} states.",
-                f"The loop {loop} reads the first {needed} outputs.",
-                do="Add the outputs, or leave the loop out.",
-                name=name,
-                loop=loop,
-                outputs=f.numel_out(0),
-                needed=needed,
-            )
     return Compiled(f, name, tuple(loops), project, others, sizes)
-
-
-def _require_columns(f, name):
-    columns = [*(f.sparsity_in(i) for i in range(f.n_in())), *(f.sparsity_out(i) for i in range(f.n_out()))]
-    if (
-        not f.is_a("SXFunction")
-        or f.has_free()
-        or (f.n_in(), f.n_out()) != (3, 1)
-        or f.numel_in(0) != 1
-        or not all(column.is_dense() and column.size2() == 1 for column in columns)
-    ):
-        raise SpecificationError(
-            f"{name!r} is the function {f}.",
-            "A compiled function is an SX function that takes columns t, x, p to one dense column.",
-            do="Concatenate and densify the outputs, declare all symbols as inputs, and expand() an MX function.",
-            name=name,
-            function=str(f),
-        )
 
 
 def _require_elementary(f):

@@ -6,7 +6,6 @@ import threading
 from itertools import pairwise
 from math import ldexp, perm
 
-import casadi as ca
 import numpy as np
 
 from servoctl.codegen.loops import (
@@ -22,10 +21,8 @@ from servoctl.codegen.loops import (
     SHORTEST,
     STEADY,
 )
-from servoctl.codegen.machine import ENOUGH, Machine, machine
 
 BLOCK = 128  # instants of a path that are solved together
-MANY_POINTS = 2_000  # CasADi has taken as long for them, one by one, as writing the function for a block at once takes
 
 _guard = threading.Lock()
 
@@ -80,39 +77,12 @@ class StepsOfThread:
 
 
 class Blocks(threading.local):
-    """Memory of one thread for the t, x, p and y (size, BLOCK) of a block, and the call that fills y.
+    """Memory of one thread for the t, x, p and y (size, BLOCK) of a block, and the call that fills y."""
 
-    A number's values at all points lie next to each other (order "C"), or the numbers of each point do ("F").
-    """
-
-    def __init__(self, block, sizes, order):
-        parts = [np.zeros((size, BLOCK), order=order) for size in sizes]
+    def __init__(self, block, sizes):
+        parts = [np.zeros((size, BLOCK), order="F") for size in sizes]
         run, self._alive = connected(block, [part.ravel("K") for part in parts])
         self.parts = parts, run
-
-
-def side_by_side(f, count):
-    """A function of columns t, x, p, with a row for each of many points: each operation of f at all points in turn.
-
-    The bits are those of f, in a fifth of the time. None if f looks values up in tables, each point by itself.
-    """
-    arguments = [ca.MX.sym(name, count, f.numel_in(i)) for i, name in enumerate("txp")]
-    columns, register, y = [ca.horzsplit(part) for part in arguments], {}, {}
-    for k in range(f.n_instructions()):
-        operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
-        if operation == ca.OP_CALL:
-            return None
-        if operation == ca.OP_INPUT:
-            register[target[0]] = columns[source[0]][source[1]]
-        elif operation == ca.OP_CONST:
-            register[target[0]] = ca.MX(f.instruction_constant(k))
-        elif operation == ca.OP_OUTPUT:
-            y[target[1]] = register[source[0]]
-        else:
-            apply = ca.MX.unary if len(source) == 1 else ca.MX.binary
-            register[target[0]] = apply(operation, *(register[i] for i in source))
-    rows = (ca.densify(y[i] if y[i].size1() == count else ca.repmat(y[i], count)) for i in range(f.numel_out(0)))
-    return ca.Function(f.name(), arguments, [ca.horzcat(ca.MX(count, 0), *rows)])
 
 
 def connected(f, parts):
@@ -132,7 +102,7 @@ class Interpreter:
 
     def __init__(self, f, project=None, sizes=None, settled=None):
         self._f, self._n_x, self._project, self._sizes, self._settled = f, f.numel_in(1), project, sizes, settled
-        self._parts, self._points = (1, self._n_x, f.numel_in(2), f.numel_out(0)), 0
+        self._parts = 1, self._n_x, f.numel_in(2), f.numel_out(0)
         self.workspace = Workspace(*self._parts[1:], self._connect)
 
     def _connect(self, row, parts):
@@ -149,19 +119,12 @@ class Interpreter:
 
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
-        left, self._points = t.size % BLOCK, self._points + t.size
-        lanes = self._lanes if self._points >= MANY_POINTS else None
-        if isinstance(lanes, Machine):
-            if t.size >= ENOUGH:
-                lanes.grid(t, x, p, y)
-                return
-            lanes = None
-        least = BLOCK // 8 if lanes else BLOCK // 2  # a block with as many points is faster than these one by one
-        blocks = t.size - left * (left < least)
-        if t.size < BLOCK and not lanes and "_blocks" not in vars(self):  # making them takes longer; same bits
+        left = t.size % BLOCK
+        blocks = t.size - left * (left < BLOCK // 2)  # a block with half as many points is faster than these one by one
+        if t.size < BLOCK and "_blocks" not in vars(self):  # making them takes longer; same bits
             blocks = 0
         if blocks:
-            parts, run = (lanes or self._blocks).parts
+            parts, run = self._blocks.parts
             parts[2][:] = 0.0 if p.ndim == 2 else p[:, None]
         for k in range(0, blocks, BLOCK):
             here, size = slice(k, k + BLOCK), min(BLOCK, t.size - k)
@@ -175,15 +138,7 @@ class Interpreter:
 
     @functools.cached_property
     def _blocks(self):
-        return Blocks(self._block, self._parts, "F")
-
-    @functools.cached_property
-    def _lanes(self):
-        """Evaluation of many points: by the `Machine`, else by CasADi; None where tables are looked up."""
-        if (by_operations := machine(self._f, self._points // BLOCK)) is not None:
-            return by_operations
-        f = side_by_side(self._f, BLOCK)
-        return None if f is None else Blocks(f, self._parts, "C")
+        return Blocks(self._block, self._parts)
 
     @functools.cached_property
     def _block(self):

@@ -10,7 +10,7 @@ from servoctl.errors import SingularProgram
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import Tape
-from servoctl.reduction.ranks import clean, eliminate, noting_dropped, pivot_order
+from servoctl.reduction.ranks import clean, eliminate, pivot_order
 
 CONVOLUTIONS = {"mul": 1.0, "div": 1.0, "quad": 1.0, "power": 1.0, "sq": 0.5, "sqrt": 0.5}  # in an operation
 
@@ -31,11 +31,10 @@ def solved_for(equations):
             order = [(rows.index(i), j) for i, j in r.order if i in rows] or pivot_order(matrix, numbers)
             columns = sorted(j for _, j in order)
             order = tuple((i, columns.index(j)) for i, j in order)
-            with noting_dropped() as entries:
-                _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns], order=order)
+            _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns], order=order)
         except SingularProgram:
             continue
-        if rows and not entries and all(_watched(pivot, equations) for pivot in pivots):
+        if rows and all(_watched(pivot, equations) for pivot in pivots):
             solved[k] = rows, columns, order
     return solved
 
@@ -71,9 +70,8 @@ def in_independent(equations):
         return None
     leading = ca.vertcat(*(row.gradient(q) for row in rows))
     matrix = leading[others, free]
-    with noting_dropped() as entries:
-        _, pivots = eliminate(matrix, ca.SX(len(others), 0), clean(*r.points.matrix(matrix)))
-    if entries or not all(_watched(pivot, equations) for pivot in pivots):
+    _, pivots = eliminate(matrix, ca.SX(len(others), 0), clean(*r.points.matrix(matrix)))
+    if not all(_watched(pivot, equations) for pivot in pivots):
         return None
     return rows, leading, (others, free, ())
 

@@ -77,8 +77,7 @@ def fits(model):
     def smooth():
         f = model.function("ode").expression
         inputs = f.sx_in()
-        quiet = not model.reduction.orders and model.dropped is None
-        alone = quiet and switching(model) is None and not steep(model, squares=False)
+        alone = not model.reduction.orders and switching(model) is None and not steep(model, squares=False)
         return alone and not ca.depends_on(f(*inputs), inputs[0])
 
     return not model.flat and not model.knots and model.once("fits lanes", smooth)
@@ -112,12 +111,12 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
 def plans_fit(model):
     """Whether plans of a model can be computed in compiled code alone, where pivots are watched at the ends of steps.
 
-    Nothing may happen on the way but that they fall: no switches, no other orders, nothing that eliminations left out.
+    Nothing may happen on the way but that they fall: no switches, no other orders.
     """
 
     def quiet():
         r = model.reduction
-        return r.cascade is None and not (r.orders or switched(r)) and model.dropped is None
+        return r.cascade is None and not (r.orders or switched(r))
 
     return model.flat and model.once("plans fit", quiet)
 

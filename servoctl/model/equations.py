@@ -9,7 +9,7 @@ from servoctl.errors import SpecificationError
 from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.definite import Definite
-from servoctl.reduction.ranks import clean, column_sizes, eliminate, noting_dropped
+from servoctl.reduction.ranks import clean, column_sizes, eliminate
 from servoctl.reduction.rows import row_levels
 from servoctl.spec.coordinates import jet_name
 
@@ -41,10 +41,7 @@ class Invariants:
     def _along(self, given, correct=False):
         """The motion of the cascade by its jets up to a given level."""
         if (given, correct) not in self._motions:
-            with noting_dropped() as entries:
-                motion = self.cascade.along(self.points, given, max(given, self.top), correct)
-            motion.dropped = entries
-            self._motions[given, correct] = motion
+            self._motions[given, correct] = self.cascade.along(self.points, given, max(given, self.top), correct)
         return self._motions[given, correct]
 
     def function(self, name, x, outputs, extra=None):
@@ -128,24 +125,17 @@ class Equations(Invariants):
         """Whether pivots are diagonal entries of definite matrices."""
         return isinstance(self.r.realisation, Definite)
 
-    @property
+    @cached_property
     def saddle(self):
         """γ'', μ and the pivots of [M -B; G 0]."""
-        return self._saddle[:3]
-
-    @cached_property
-    def _saddle(self):
-        with noting_dropped() as entries:
-            return *saddle.solve(self), entries
+        return saddle.solve(self)
 
     @cached_property
     def _leading(self):
-        """The pivots of L, and what its elimination leaves out."""
+        """The pivots of L."""
         if self.cascade is not None:
-            motion = self._along(self.top - 1 if self.r.free else 0)
-            return motion.pivots, motion.dropped
-        with noting_dropped() as entries:
-            return self._solve(ca.SX(self.q.n, 0))[1], entries
+            return self._along(self.top - 1 if self.r.free else 0).pivots
+        return self._solve(ca.SX(self.q.n, 0))[1]
 
     def rest(self, rows, poles=False):
         """Some rows raised to order s̄, at γ^(s̄) = 0; with their error dynamics if `poles`."""
@@ -171,34 +161,13 @@ class Equations(Invariants):
     @cached_property
     def all_pivots(self):
         """Pivots by which the equations divide: a list of (name, SX)."""
-        leading = (self._saddle[2:] if self.sparse else self._leading)[0]
+        leading = self.saddle[2] if self.sparse else self._leading
         return [*self.r.pivots, *((f"leading matrix {i + 1}", p) for i, p in enumerate(leading))]
 
     @cached_property
     def pivots(self):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
         return [(name, p) for name, p in self.all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
-
-    @cached_property
-    def entries_dropped(self):
-        """What eliminations left out as zero, unless all terms cancel by algebra: a list of SX."""
-        from servoctl.jets.algebra import cancels
-
-        entries = *self.r.dropped, *(self._saddle[2:] if self.sparse else self._leading)[1]
-        return [entry for entry in entries if not cancels(entry)]
-
-    def dropped(self):
-        """Of what eliminations left out the values, then the sizes of their terms, of (t, Z, p); None without any.
-
-        The jets Z extend beyond s̄ as far as these depend on them.
-        """
-        entries = self.entries_dropped
-        if not entries:
-            return None
-        places = filter(None, map(self.q.where, ca.symvar(ca.vertcat(*entries))))
-        highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
-        above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
-        return self.function("dropped", ca.vertcat(self.jets, *above), [*entries, *map(size_of_terms, entries)])
 
     def constant_pivots(self):
         """A function of the parameters: the pivots that depend on these alone."""

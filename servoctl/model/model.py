@@ -36,9 +36,7 @@ from servoctl.reduction.definite import Definite, definite
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
-from servoctl.reduction.ranks import alive
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
-from servoctl.reduction.samples import warn_of_samples
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
@@ -91,14 +89,12 @@ def derive(
     Warns
     -----
     RuntimeWarning
-        For a residual that is a product and vanishes about the guess by more than one of its factors, and for splines
-        whose samples do not determine a derivative of the path that the actuation contains.
+        For a residual that is a product and vanishes about the guess by more than one of its factors.
     """
     require_parts(mechanism, program, guess)
     model = derived(needed(mechanism, program, keep, guess or {}), program, guess)
     r = model.reduction
     warn_of_products(r)
-    warn_of_samples(r.switches, model.parameters, r.smoothness, r.knots.times)
     return model
 
 
@@ -222,17 +218,11 @@ class Model(Detailed):
 
     def _holds(self, values):
         """Whether every decision of the derivation is the same with other parameters."""
-        return holds(self.reduction, values) and self._constant_pivots_hold(values) and self._dropped_hold(values)
+        return holds(self.reduction, values) and self._constant_pivots_hold(values)
 
     def _constant_pivots_hold(self, values):
         f = self.once("constant pivots", lambda: self.equations.constant_pivots())
         return bool(strong(*(f(p).full() for p in (values, self.reduction.context.values))).all())
-
-    def _dropped_hold(self, values):
-        """Whether what eliminations left out vanishes with other parameters, too."""
-        if self.dropped is None:
-            return True
-        return not alive(self.equations.entries_dropped, replace(self.reduction.points, values=values)).any()
 
     def near(self, t, jets, sizes=()):
         """The model of the same specification, derived with pivots chosen at an instant of the motion.
@@ -508,16 +498,6 @@ class Model(Detailed):
             return compiled(f, name, *options)
 
         return self.once(name, build)
-
-    @property
-    def dropped(self):
-        """What eliminations left out as zero, and the sizes of its terms, compiled, of (t, Z, p); None if nothing."""
-
-        def build():
-            f = self.equations.dropped()
-            return None if f is None else compiled(f, f.name())
-
-        return self.once("dropped", build)
 
     def signals(self, kind, rate=0):
         """Names of a group of signals, and the compiled function (t, Z, p) of their `rate`-th time derivatives.

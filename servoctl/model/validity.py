@@ -27,8 +27,8 @@ MOVES = 8  # Newton steps of a point to the manifold of other parameters
 class Quantities:
     """What decides whether a derivation is valid, as a function of (t, Z, p).
 
-    The groups are "slopes" that vanish with their "jets" and "terms", "pivots", "conditions" and "dropped" entries,
-    which vanish, and the inertia matrix, "mass", which has no sizes.
+    The groups are "slopes" that vanish with their "jets" and "terms", "pivots", "conditions", which vanish, and the
+    inertia matrix, "mass", which has no sizes.
     """
 
     function: object  # values and sizes of the terms of all groups; None if these contain jets above s̄
@@ -67,7 +67,6 @@ def _groups(equations):
         "terms": terms,
         "pivots": [pivot for _, pivot in equations.all_pivots],
         "conditions": r.conditions,
-        "dropped": equations.entries_dropped,
         "mass": ca.densify(r.mechanism.mass).nonzeros(),
     }
 
@@ -158,7 +157,6 @@ def _criterion(model, varied):
         return None
     met = [ca.SX(1)]
     met += [ca.fabs(value[i]) <= HELD * ca.fmax(size[i], TINY) for i in some & {*groups["conditions"]}]
-    met += [ca.fabs(value[i]) <= ENTRY * size[i] for i in some & {*groups["dropped"]}]
     for i, least in zip(groups["pivots"], (WEAKER * known.pivots).tolist(), strict=True):
         met += [ca.fabs(value[i]) >= least, ca.fabs(value[i]) > ENTRY * size[i]] if i in some else []
     if some & {*groups["mass"]}:
@@ -223,12 +221,10 @@ def _valid(model, known, t, z, values):
     if not (np.abs(left) <= HELD * np.maximum(of_left, TINY)).all():  # a velocity that is kept at zero is rounding
         sizes = r.points.sizes(r.top) * r.points.factorials(r.top)
         of_left = np.maximum(of_left, at(at_usual_size(z, sizes, model.nq))["conditions"][1])
-    dropped, of_dropped = found["dropped"]
     checks = (
         dead,
         strong(clean(*found["pivots"]), known.pivots[:, None, None]),
         np.abs(left) <= HELD * np.maximum(of_left, TINY),
-        np.abs(dropped) <= ENTRY * of_dropped,
     )
     positive = _positive(found["mass"][0].reshape(n, n, -1)).reshape(cases, -1).all(axis=1)
     return np.all([check.all(axis=(0, 2)) for check in checks], axis=0) & positive

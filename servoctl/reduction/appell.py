@@ -4,19 +4,15 @@ The reaction is B μ. With the quasi-coordinates split into dependent ones D and
 A = ∂γ_D/∂γ_I = -B_D⁻ᵀ B_Iᵀ and T = [A; 1] spans ker Bᵀ. For B = Gᵀ the rows of Tᵀ r = 0 are (3.18) as printed.
 """
 
-from dataclasses import replace
-from itertools import combinations, islice
-
 import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.reduction.ranks import clean, decide_all, decide_each, eliminate, equilibrate
+from servoctl.reduction.ranks import clean, decide_all, eliminate, equilibrate
 from servoctl.values import frozen
 
 NEGATIVE = 1e-9  # eigenvalues of a scaled inertia matrix below minus this are no rounding errors
 NAMED = 1e-6  # components of a direction below this fraction of the largest are not named in an error
-SPLITS = 100  # choices of dependent coordinates that are tried where the first leads to a contradiction
 
 
 @frozen
@@ -48,18 +44,6 @@ class Realisation:
         a, pivots = eliminate(transposed[:, dependent], -transposed[:, independent], self.numbers[:, dependent])
         return forces[independent, :] + a.T @ forces[dependent, :], [p for p in pivots if ca.symvar(p)]
 
-    def splits(self):
-        """Splits into dependent and independent coordinates: the chosen one, and others regular at some points."""
-        yield self
-        every = range(0 if self.unreached else self.B.shape[0])
-        for dependent in islice(combinations(every, len(self.dependent)), SPLITS):
-            ranks = decide_each(self.numbers[:, list(dependent)])
-            regular = [p for p, rank in enumerate(ranks) if rank.rank == len(dependent)]
-            if regular and dependent != self.dependent:
-                independent = tuple(i for i in every if i not in dependent)
-                numbers = self.numbers[:, :, regular]
-                yield replace(self, dependent=dependent, independent=independent, numbers=numbers)
-
     def multipliers(self, balance):
         """μ with B_D μ = r_D, (b,) SX."""
         rows = list(self.dependent)
@@ -73,12 +57,6 @@ def saddle(mechanism, material):
     n, k = mechanism.q.n, len(material)
     G = ca.vertcat(*(row.gradient(mechanism.q) for row in material)) if material else ca.SX(0, n)
     return ca.vertcat(ca.horzcat(mechanism.mass, G.T), ca.horzcat(G, ca.SX.zeros(k, k)))
-
-
-def plant_accelerations(mechanism, material, forces, second, points):
-    """γ'' of the plant, the upper part of `plant_solution`, (n, columns) SX; the pivots."""
-    solution, pivots = plant_solution(mechanism, material, forces, second, points)
-    return solution[: mechanism.q.n, :], pivots
 
 
 def plant_solution(mechanism, material, forces, second, points):

@@ -238,11 +238,8 @@ class Expressions(_Follow):
     """A motion by symbols of its first jets.
 
     `levels` has by place of the row ψ^(given - order), as a function of t, q, ..., γ^(given); `newton` is the Newton
-    step to the coordinates, a list of nq SX. `pivots` are those of each block's elimination, and `dropped` is what
-    eliminations left out as zero.
+    step to the coordinates, a list of nq SX. `pivots` are those of each block's elimination.
     """
-
-    dropped = ()
 
     def __init__(self, cascade, points, given, correct):
         q = cascade.q

@@ -10,13 +10,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
-from servoctl.jets.branches import cse, shown
-from servoctl.reduction.manifold import POINTS_SEED, SPREAD, anywhere, sample
+from servoctl.jets.branches import cse
+from servoctl.reduction.manifold import SPREAD, anywhere, sample
 from servoctl.reduction.ranks import clean, decide, decide_each, eliminate, generic
 from servoctl.reduction.rows import (
     Row,
     dependence,
-    factors,
     leading,
     merge_uses,
     settle,
@@ -67,7 +66,7 @@ def complete(q, rows, context, starts=None, most=None, so_far=None):
             deep.so_far = rows, pivots, before, dropped
             raise
         if combination.row.order < 0:
-            raise _dependent(q, rows, combination, context)
+            raise _dependent(q, rows, combination)
         rows[combination.replaces] = replace(combination.row, parts=())
         pivots += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
 
@@ -121,7 +120,7 @@ def _lowest(q, rows, numbers, context, starts=None, most=None):
 def _combination(q, rows, b, support, numbers, context, starts=None):
     """Row b combined with the others of a support, with its order on the manifold of all other rows."""
     top = rows[b].order
-    _require_affine(q, rows, support, top, context)
+    _require_affine(rows, support, top)
     others = [a for a in support if a != b]
     parts, pivots = _combine(q, rows, b, others, top, numbers)
     story = told(rows[b], [rows[a] for a in others], top)
@@ -159,53 +158,22 @@ def _divided(q, rows, combination, context):
     if len(combination.support) == 1:
         if _independent_in_q(q, [rows[b]], combination.points):  # but no velocity moves it where it holds at all times
             raise _beyond_velocities(q, [rows[b].name])
-        raise vanishing_gradient(q, rows[b], context, *_factor(q, rows, b, context))
+        raise vanishing_gradient(rows[b])
     level = whole.order
     beside = np.abs(_slopes_beside(q, rows, combination, context)).max(axis=1, initial=0.0)
     i = int(np.argmax(beside))
     jet = q.jet_names(level)[i]
     if not np.abs(combination.points.jet(level)[i]).min(initial=np.inf) > DIVIDES * context.sizes.get(jet, 1.0):
-        raise vanishing_gradient(q, rows[b], context)  # at rest a = 0 would follow from nothing
+        raise vanishing_gradient(rows[b])  # at rest a = 0 would follow from nothing
     rest = [row for a, row in enumerate(rows) if a != b]
     row = replace(whole, expression=ca.densify(whole.gradient(q, level))[i], parts=())
     row, points = settle(q, row, rest, context, combination.points)
     if row is None or not 0 <= row.order < level:
-        raise vanishing_gradient(q, rows[b], context)
+        raise vanishing_gradient(rows[b])
     points = sample(q, [*rest, row], level, context, starts=points)
     if not len(points.t) or np.any(clean(*values_and_sizes(whole, points))):
-        raise vanishing_gradient(q, rows[b], context)
+        raise vanishing_gradient(rows[b])
     return replace(combination, row=replace(row, story=f"{combination.row.story}, divided by {jet}"), points=points)
-
-
-def _factor(q, rows, b, context):
-    """A factor of row b, and the rows on whose solutions it vanishes; of others the one to divide by; else nothing."""
-    row, rest = rows[b], [row for a, row in enumerate(rows) if a != b]
-    level = max([row.order, q.order(row.expression), *(other.order for other in rest)])
-    found = factors(row.expression)
-    points = sample(q, rest, level, context)
-    if len(found) > 1 and len(points.t):
-        zero = [not np.any(clean(*points.evaluate([f]))) for f in found]
-        if any(zero):
-            left = ca.SX(1)
-            for f, vanishes in zip(found, zero, strict=True):
-                left = left if vanishes else left * f
-            other = replace(row, expression=left, order=max(q.order(left), 0))
-            soluble = ca.symvar(left) and len(sample(q, [*rest, other], level, context).t)
-            return (found[zero.index(True)], [other.name for other in rest]) if soluble else ()
-    points = sample(q, rows, level, context)
-    if len(found) > 1 and len(points.t):
-        return max(found, key=lambda f: np.abs(points.evaluate([f])[0]).min()), []
-    jets = [jet for jet in q.gamma(row.order) if _vanishes_with(row, jet, points)] if row.order else []
-    return (jets[0], []) if jets else ()
-
-
-def _vanishes_with(row, jet, points):
-    """Whether a row is a multiple of a jet."""
-    beside = replace(points, z=points.z + SPREAD * np.random.default_rng(POINTS_SEED).uniform(-1, 1, points.z.shape))
-    without = ca.substitute(row.expression, jet, 0)
-    return jet.element_hash() in {s.element_hash() for s in ca.symvar(row.expression)} and not np.any(
-        clean(*beside.evaluate([without]))
-    )
 
 
 def _beside_manifold(q, rows, b, context):
@@ -251,11 +219,10 @@ def _derivative_name(row, k):
     return row.name if k == 0 else f"D{'' if k == 1 else k}({row.name})"
 
 
-def _require_affine(q, rows, support, top, context):
+def _require_affine(rows, support, top):
     indices = [a for a in support if rows[a].order == top and not rows[a].affine]
     nonlinear = [rows[a].name for a in indices]
     if nonlinear:
-        _refuse_factor(q, rows, indices, context)
         raise SpecificationError(
             f"The residual {nonlinear[0]!r} is nonlinear in its highest derivative and depends on other rows there.",
             "Hidden constraints are derived from rows that are linear in their highest derivatives.",
@@ -265,23 +232,7 @@ def _require_affine(q, rows, support, top, context):
         )
 
 
-def _refuse_factor(q, rows, indices, context):
-    """Refuse a row with a factor that vanishes on the solutions of the others: it follows from them."""
-    for b in (b for b in indices if not rows[b].story):  # a combination is no residual that could be divided
-        found, others = (*_factor(q, rows, b, context), None, None)[:2]
-        if others:
-            factor = shown(found)
-            raise SpecificationError(
-                f"The residual {rows[b].name!r} has the factor {factor}, zero by {', '.join(map(repr, others))}.",
-                "Each residual restricts the motion beyond the others.",
-                do=f"Divide {rows[b].name!r} by {factor}.",
-                row=rows[b].name,
-                factor=factor,
-                rows=others,
-            )
-
-
-def _dependent(q, rows, combination, context):
+def _dependent(q, rows, combination):
     """The error of rows whose combination depends on t alone."""
     names, story = [rows[a].name for a in combination.support], combination.row.story
     zero = not np.any(clean(*values_and_sizes(combination.row, combination.points)))
@@ -297,13 +248,12 @@ def _dependent(q, rows, combination, context):
             combination=story,
         )
     if zero:
-        _refuse_factor(q, rows, combination.support, context)
         if _independent_in_q(q, [rows[a] for a in combination.support], combination.points):
             return _beyond_velocities(q, names)
         return SpecificationError(
             f"The constraints {listed} are dependent: the combination {story} vanishes identically.",
             "Constraints must be independent of each other.",
-            do=f"Remove one of {listed}.",
+            do=f"Remove one of {listed}, or divide it by a factor that the others keep at zero.",
             rows=names,
             combination=story,
         )
@@ -357,7 +307,7 @@ def _no_common_state(q, rows, context):
         except InconsistentStart:  # some of the rows alone have no common state
             return _no_state(q, given, context)
         if combination.row.order < 0:
-            return _dependent(q, rows, combination, context)
+            return _dependent(q, rows, combination)
         rows = [combination.row if a == combination.replaces else row for a, row in enumerate(rows)]
 
 

@@ -2,7 +2,6 @@
 
 from copy import copy
 from functools import cached_property
-from itertools import pairwise
 from math import factorial
 
 import casadi as ca
@@ -168,49 +167,6 @@ class Switches:
 
     def _is_table(self, node):
         return node is not None and _counts(self.tape.nodes[node])
-
-    def tables(self, name):
-        """The knots of splines of time alone in a residual, (n,) arrays by the nodes of their arguments.
-
-        The longest of each argument.
-        """
-        if not self.timed or name not in self.residuals:
-            return {}
-        nodes, found = self._numeric_tape.nodes, {}
-        timed = {side for sides in self.timed for side in sides}
-        pending, seen = [self.tape.outputs[list(self.residuals).index(name)]], set()
-        while pending:
-            node = pending.pop()
-            if node in seen:
-                continue
-            seen.add(node)
-            _, args, data = nodes[node]
-            knots = data.numbers if _counts(nodes[node]) else getattr(data, "knots", ())
-            if args and args[0] in timed and len(knots) > len(found.get(args[0], ())):
-                found[args[0]] = knots
-            pending.extend(args)
-        return found
-
-    def passage(self, values, argument, span):
-        """The longest way of an argument in one direction within a span: instants [s], and its rising values there."""
-        t = np.linspace(*span, SCAN)
-        s = self._at(argument, t, values)
-        turns = np.flatnonzero(np.diff(np.sign(np.diff(s)))) + 1
-        first, last = max(pairwise([0, *turns, SCAN - 1]), key=lambda pair: abs(s[pair[1]] - s[pair[0]]))
-        t, s = t[first : last + 1], s[first : last + 1]
-        return (t, s) if s[-1] > s[0] else (t[::-1], s[::-1])
-
-    def passed(self, values, argument, knots, passage):
-        """Ascending instants at which an argument is at knots of a passage, by a Newton step from straight lines."""
-        t = np.interp(knots, passage[1], passage[0])
-        value, slope = (np.broadcast_to(c, t.shape) for c in self._run(t, values, 2).c[argument][:2])
-        step = np.divide(knots - value, slope, out=np.zeros(t.shape), where=slope != 0, casting="unsafe")
-        return np.sort(np.clip(t + step, *sorted(passage[0][[0, -1]])))
-
-    def coefficient(self, name, t, values, k):
-        """The Taylor coefficient k of a residual at times (any shape), for fixed jets."""
-        c = self._run(np.ravel(t), values, k + 1).outputs[list(self.residuals).index(name)][k]
-        return np.broadcast_to(c, np.size(t)).astype(float).reshape(np.shape(t))
 
     def _at(self, node, t, values):
         """Values of a node at times (N,)."""

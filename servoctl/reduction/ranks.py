@@ -9,9 +9,6 @@ among those of sufficient size at the points, and leaves out entries that vanish
 whose size along a motion shows when the choice has become bad.
 """
 
-from contextlib import contextmanager
-from contextvars import ContextVar
-
 import casadi as ca
 import numpy as np
 
@@ -22,8 +19,6 @@ from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TIN
 from servoctl.values import frozen
 
 THRESHOLD = 0.1  # least size of a pivot, relative to the largest entry of its equilibrated row
-SUSPECT = 1e-8  # of the size of its terms: an entry above this is evaluated in extended precision
-_dropped = ContextVar("dropped", default=None)  # where eliminations note what they leave out
 LARGE, THIN = 40, 0.25  # rows and columns of a matrix, and its share of nonzero entries, for sparse elimination
 SWEEPS = 6  # of equilibration; each takes the square root of the remaining factors: 1e±30 comes within a factor of 3
 
@@ -202,25 +197,6 @@ def _difference(a, b):
     return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)
 
 
-@contextmanager
-def noting_dropped():
-    """The list of the entries (SX scalars) that eliminations inside leave out, since they vanish identically."""
-    entries = []
-    token = _dropped.set(entries)
-    try:
-        yield entries
-    finally:
-        _dropped.reset(token)
-
-
-def alive(entries, points):
-    """How many times its rounding an entry that was left out is at each of some points, at least 1, (N,); or 0."""
-    values, sizes = points.evaluate(entries)
-    with np.errstate(all="ignore"):
-        share = np.nan_to_num(np.abs(values) / (ENTRY * sizes), posinf=0.0).max(axis=0, initial=0.0)
-    return np.where(share > 1.0, share, 0.0)
-
-
 def pivot_order(matrix, numbers):
     """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points."""
     n = matrix.shape[0]
@@ -255,25 +231,20 @@ class _System:
     """A system under elimination.
 
     `rows` has for each row its entries by column: an SX scalar, and its equilibrated numbers at the points where pivots
-    are chosen. What is zero at all of them is left out if it vanishes identically. Where an elimination asks
-    that, the entries that follow have behind their numbers the values at random points that tell.
-    `candidates` are the columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet,
-    `members` those of a column.
+    are chosen. What is zero at all of them is left out if it vanishes identically. `candidates` are the columns whose
+    entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
     """
 
     def __init__(self, matrix, right, numbers, diagonal=False, in_order=False):
         n, self.diagonal, self.in_order = matrix.shape[0], diagonal, in_order
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
-        self.points, self.asked, self.followed = scaled.shape[2], False, False
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
         doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
         vanishing = _vanish([entry for _, _, entry in doubtful])
         zeros = {(i, j) for (i, j, _), zero in zip(doubtful, vanishing, strict=True) if zero}
         self.rows = [{} for _ in range(n)]
         for i, j, entry in entries:
-            if (i, j) in zeros:
-                _leave_out(entry)
-            else:
+            if (i, j) not in zeros:
                 self.rows[i][j] = entry, scaled[i, j]
         self.rhs = (
             [right[i, :].elements() for i in range(n)] if right.shape[1] != 1 else [[b] for b in right.elements()]
@@ -292,7 +263,7 @@ class _System:
             row = {i: row[i]} if i in row else {}
         if not row:
             return []
-        sizes = np.abs([number[: self.points] for _, number in row.values()]).min(axis=1).tolist()
+        sizes = np.abs([number for _, number in row.values()]).min(axis=1).tolist()
         least = THRESHOLD * max(sizes)
         return [(j, size) for j, size in zip(row, sizes, strict=True) if size >= least and size > 0.0]
 
@@ -301,8 +272,6 @@ class _System:
 
         Among these a number is taken, if there is one: it cannot vanish, and less depends on it.
         """
-        if self.asked and not self.followed:
-            self._follow()
         i, j = pivot or self._pivot()
         row = self.rows[i]
         del self.open[i]
@@ -343,8 +312,7 @@ class _System:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
             left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
-            if not numbers[: self.points].any() and self._vanishes(left, numbers[self.points :]):
-                _leave_out(left)
+            if not numbers.any() and _vanish([left])[0]:
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
@@ -354,18 +322,6 @@ class _System:
             if not b.is_zero():
                 right[k] = subtract(right[k], multiply(factor, b))
 
-    def _vanishes(self, entry, values):
-        """Whether an entry vanishes identically, from its values at random points if they are followed."""
-        self.asked = True
-        return bool(vanish(values)) if self.followed else _vanish([entry])[0]
-
-    def _follow(self):
-        """Append the values at random points to the numbers of all entries that are still eliminated."""
-        places = [(self.rows[i], j) for i in self.open for j in self.rows[i]]
-        for (row, j), values in zip(places, spread([row[j][0] for row, j in places]), strict=True):
-            row[j] = row[j][0], np.append(row[j][1], values)
-        self.followed = True
-
 
 _ZERO = ca.SX(0)
 
@@ -373,12 +329,6 @@ _ZERO = ca.SX(0)
 def _vanish(entries):
     """Whether each of some SX scalars vanishes identically."""
     return [vanish(values) for values in spread(entries)] if entries else []
-
-
-def _leave_out(entry):
-    noted = _dropped.get()
-    if noted is not None and not entry.is_zero():
-        noted.append(entry)
 
 
 def _back(value, terms, pivot):

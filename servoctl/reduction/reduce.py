@@ -17,7 +17,7 @@ from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, at_usual_size, sample
 from servoctl.reduction.orders import Orders
-from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, noting_dropped, pivot_order
+from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import realisation, wished, wished_balance
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_alone
 from servoctl.reduction.scales import ORDINARY, usual
@@ -53,7 +53,6 @@ class Reduction(Packed):
     context: Context
     original: dict  # rows of the designer's residuals and material constraints, by name
     cascade: Cascade | None = None  # the rows by blocks, where they are deep
-    entries_dropped: tuple = ()  # SX that the eliminations of the derivation left out, as they vanish identically
     order: tuple = ()  # row and column of each pivot of the leading matrix; empty if they are chosen at the points
 
     def __repr__(self):
@@ -134,20 +133,10 @@ class Reduction(Packed):
         """The rows along a motion."""
         return Flow(self.mechanism.q, self.rows, self.top, self.points)
 
-    @property
+    @cached_property
     def multipliers(self):
         """Multipliers of the reaction, those of the program first, (b,) SX of t, q, γ', γ''."""
-        return self._multipliers[0]
-
-    @cached_property
-    def _multipliers(self):
-        with noting_dropped() as entries:
-            return self.realisation.multipliers(self.balance), entries
-
-    @property
-    def dropped(self):
-        """What eliminations left out, as it vanishes identically: a list of SX of t, jets and parameters."""
-        return [*self.entries_dropped, *self._multipliers[1]]
+        return self.realisation.multipliers(self.balance)
 
     @cached_property
     def actuation(self):
@@ -205,13 +194,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     raise errors.get(True, errors.get(False))
 
 
-def _reduced(*specification):
-    """The reduction by points of a context, with what its eliminations leave out."""
-    with noting_dropped() as entries:
-        return replace(_by_points(*specification), entries_dropped=tuple(entries))
-
-
-def _by_points(mechanism, program, switches, balance, context):
+def _reduced(mechanism, program, switches, balance, context):
     """The reduction by points of a context."""
     q = mechanism.q
     original = [
@@ -220,12 +203,8 @@ def _by_points(mechanism, program, switches, balance, context):
     ]
     constraints, points, of_constraints = _constraints(mechanism, program, original, context)
     realised, points, of_sharing = realisation(mechanism, program, constraints, points, context)
-    for split in realised.splits():
-        dynamics, of_split = split.dynamics(balance)
-        dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
-        if not any(_contradicts(row, points) for row in dynamics):
-            realised = split
-            break
+    dynamics, of_split = realised.dynamics(balance)
+    dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
     _require_motion(dynamics, program)
     rows = [*(realised.settled or constraints), *dynamics]
     solve = complete if realised.settled else completed
@@ -320,14 +299,6 @@ def _constraints(mechanism, program, original, context):
         # Hidden constraints among these rows follow with those of (3.18); here they only show contradictions.
         complete(q, constraints, context, points)
     return constraints, points, pivots
-
-
-def _contradicts(row, points):
-    """Whether a row depends on t alone and is not zero.
-
-    It may have been divided by a jet that is zero in every motion, which is a factor of it with another split.
-    """
-    return row.order < 0 and bool(np.any(clean(*points.evaluate([row.expression]))))
 
 
 def _require_motion(dynamics, program):

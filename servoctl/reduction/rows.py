@@ -22,7 +22,6 @@ VANISHED = 1e-5  # gradient on a row's solutions, relative to random points, bel
 SQUARE_STEPS = 40  # Newton steps towards these solutions; for a square each only halves the distance
 SOLVED = 1e-3  # scaled residual of points at which the gradient of a possible square is judged
 FELT = 1e-9  # a term above this fraction of a row's parts is not their rounding
-MOSTLY = 0.5  # of the solutions at which a term vanishes: 1 - cos φ is zero at φ = 2π, too
 SAME_DEPTH = 20  # nested operations to which factors are compared
 BESIDE = 0.5  # relative distance of the points with which solutions are compared
 
@@ -166,7 +165,7 @@ def _refuse_square(q, row, context, slopes=None):
     vanished, solved = (after < VANISHED * before) | ((way > 0) & (after**2 * way < left * before)), residual < SOLVED
     if solved.any() and vanished[solved].all():
         if not _regular_nearby(flow, row, end.take(np.flatnonzero(solved))):
-            raise vanishing_gradient(q, row, context, _repeated(factors(row.expression)))
+            raise vanishing_gradient(row)
 
 
 def _regular_nearby(flow, row, points):
@@ -186,63 +185,25 @@ def _regular_nearby(flow, row, points):
     return bool(np.any(converged & (here > VANISHED * there)))
 
 
-def _zeros(q, row, context):
-    """The innermost terms of a row that vanish on its solutions with a gradient: y - x in 1 - cos(y - x)."""
-    starts = sample(q, [], max(q.order(row.expression), row.order), context)
-    flow = Flow(q, [row], starts.level, starts)
-    z, residual = solve(flow, starts.t, starts.z, iterations=SQUARE_STEPS)
-    solved = np.flatnonzero(residual < SOLVED)
-    starts, solutions = starts.take(solved), replace(starts, z=z).take(solved)
-    terms = [e for e in _terms(row.expression)[1:] if q.order(e) >= 0]
-    before, after = (np.abs(points.evaluate(terms)[0]) for points in (starts, solutions))
-    vanishing = zip(terms, (after <= SOLVED * before).mean(axis=1) > MOSTLY, strict=True)
-    found = [e for e, zero in vanishing if zero and len(solved) and _has_gradient(q, e, starts, solutions)]
-    hashes = {e.element_hash() for e in found}
-    return [e for e in found if not hashes & {inner.element_hash() for inner in _terms(e)[1:]}]
-
-
-def _terms(expression):
-    """The subexpressions of an SX scalar, itself first."""
-    known, open_ = {}, [expression]
-    while open_:
-        e = open_.pop()
-        if e.element_hash() not in known:
-            known[e.element_hash()] = e
-            open_ += [e.dep(i) for i in range(e.n_dep())]
-    return list(known.values())
-
-
-def _has_gradient(q, term, *points):
-    """Whether the gradient of a term in its highest jets is not far smaller at solutions than at random points."""
-    gradient = ca.jacobian(term, q.jet(q.order(term)))
-    anywhere, there = (np.abs(p.matrix(gradient)[0]).max(axis=(0, 1)) for p in points)
-    return bool(np.all(there > VANISHED * anywhere))
-
-
-def vanishing_gradient(q, row, context, factor=None, others=()):
-    """The error of a row without a gradient where it holds, by reason of a factor or of terms that vanish there."""
-    zeros = [shown(e) for e in ([] if factor is not None else _zeros(q, row, context))]
-    because, listed = "", " and ".join(zeros)
-    do = f"Write {row.name!r} so that it changes sign, with a gradient, at its solutions."
-    if factor is not None:
-        because, do = f": it has the factor {shown(factor)}", f"Divide {row.name!r} by {shown(factor)}."
-    elif zeros:
-        because, residuals = f", where {listed} = 0", "the residual" if len(zeros) == 1 else "separate residuals"
-        do = f"Write {listed} as {residuals} in place of {row.name!r}."
+def vanishing_gradient(row):
+    """The error of a row without a gradient where it holds; it names a factor that the row has twice."""
+    found = factors(row.expression)
+    factor = next((f for i, f in enumerate(found) if _among(f, found[:i])), None)
+    because = "" if factor is None else f": it has the factor {shown(factor)} twice"
     return SingularProgram(
         f"The gradient of row {row.name!r} vanishes on its own solutions, or has no value there{because}.",
         "A constraint φ = 0 needs a gradient there; φ², |φ| and 1 - cos φ have none, and determine no direction of the "
         "motion.",
-        do=do,
+        do=f"Write {row.name!r} so that it changes sign, with a gradient, at its solutions: φ in place of φ² or of "
+        "1 - cos φ, and one residual for each direction in place of a distance.",
         row=row.name,
         **({} if factor is None else {"factor": shown(factor)}),
-        **({"zeros": zeros} if zeros else {}),
     )
 
 
-def _repeated(items):
-    """The first SX scalar that occurs twice, or None."""
-    return next((f for i, f in enumerate(items) if any(ca.is_equal(f, g, SAME_DEPTH) for g in items[:i])), None)
+def _among(factor, others):
+    """Whether a factor is one of some others."""
+    return any(ca.is_equal(factor, other, SAME_DEPTH) for other in others)
 
 
 def factors(expression):
@@ -263,7 +224,7 @@ def factors(expression):
 def alternatives(q, row, context):
     """Factors of a row that have zeros about the guess, in words, where there are several: it holds by any of them."""
     found = [f for f in factors(row.expression) if q.order(f) >= 0]
-    found = [f for i, f in enumerate(found) if not any(ca.is_equal(f, g, SAME_DEPTH) for g in found[:i])]
+    found = [f for i, f in enumerate(found) if not _among(f, found[:i])]
     rest = []
     if len(found) == 1:  # perhaps a sum whose terms have a jet in common
         jets = [s for s in _perhaps_factors(q, found[0]) if ca.substitute(found[0], s, 0).is_zero()]

@@ -202,7 +202,7 @@ def spline(t, times, points, smoothness=2, ends="rest"):
     Through more than 200 points, with numbers as times and points, the coefficients are a table, so that samples of a
     measurement may be as many as memory holds. Each point that is an expression costs about 30 operations at every
     evaluation. Derivatives amplify the rounding and noise of samples: an error e of samples at a distance h becomes one
-    of about e (pi/h)^k in derivative k, where e is 1e-16 of their size at least. `derive` warns where this matters.
+    of about e (pi/h)^k in derivative k, where e is 1e-16 of their size at least.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@
                    of taylor.c it is the vector of NAME_still, what depends on p alone, and NAME_moving
    CORRECTIONS, ...    the tolerances of Newton's method and of continuation in loops.py
 
-   and what the file itself names. A file that is read alone takes them from alone.h. */
+   and what the file itself names; tests/alone.h is an example, by which each file compiles alone. */
 #ifndef UNIT_H
 #define UNIT_H
 
@@ -31,9 +31,5 @@ static inline int all_finite(int64_t count, const double *x)
 
 #include "inline_sine.h"
 #include "inverse_erf.h"
-
-#ifndef NAME
-#include "alone.h"
-#endif
 
 #endif

@@ -1,4 +1,4 @@
-/* A unit of small sizes, for editors and compilers that see one file of this folder alone. */
+/* A unit of small sizes, by which each C file of servoctl/codegen/c compiles alone. */
 #define NAME example
 #define NX 4
 #define NP 3
@@ -36,13 +36,6 @@
 #define DEGRADED 0.02
 #define NEGLIGIBLE 1e-7
 #define FAR_OFF 30.0
-
-/* machine.c */
-#define WIDTH 64
-#define INPUT_ 1
-#define CONST_ 2
-#define OUTPUT_ 3
-#define OPERATIONS EACH(4, a + b) EACH(5, sqrt(a))
 
 /* batch.c */
 #define VECTORS 2
