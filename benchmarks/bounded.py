@@ -14,6 +14,7 @@ from harness import Row
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.model.equations import invariant_names
 
 M, L, I, C, D, GAMMA = 6.875, 1.0, 0.57, 50.0, 0.25, 0.5  # kg, m, kg m^2, N m/rad, N m s/rad, 1
 WINDOW = 15.0  # time constants before and after the path for solve_bvp
@@ -76,7 +77,7 @@ def by_instants(model):
 def of_model(scene, values):
     """The free angle by solve_bvp, with the rates of the free joint on the invariants of the model."""
     model, duration, name, _ = scene
-    x0, n, m = np.asarray(model.start().values), len(model.state_names), len(model.invariant_names())
+    x0, n, m = np.asarray(model.start().values), len(model.state_names), len(invariant_names(model))
     free = [model.state_names.index(each) for each in (name, f"d{name}")]
     solved = [i for i in range(n) if i not in free]
     values = values(model)

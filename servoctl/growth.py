@@ -22,6 +22,7 @@ from servoctl.methods import flow
 from servoctl.methods.kinks import SMOOTHER, stays_on_kink
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.stability import stability_function
+from servoctl.model.equations import invariant_names
 from servoctl.model.switching import switching
 from servoctl.run import SAME_TIME, Run, require_run
 from servoctl.tolerances import TINY
@@ -371,7 +372,7 @@ def linearised(model, run, count):
 
 def _dimension(model):
     """f, the number of states less that of invariants: Σ o_a, and more where coordinates outnumber velocities."""
-    return len(model.state_names) - len(model.invariant_names())
+    return len(model.state_names) - len(invariant_names(model))
 
 
 def _states(model, run):
@@ -417,7 +418,7 @@ def _bases(model, t, x, size):
 @np.errstate(all="ignore")
 def _kernel(model, t, x, size):
     """N, the kernel of the invariants' Jacobian in scaled states (K, n_x, f), and where it is not finite (K,)."""
-    m = len(model.invariant_names())
+    m = len(invariant_names(model))
     C = _slopes(model, "invariants", t, x, m) * size
     rows = np.sqrt((C**2).sum(axis=2, keepdims=True))
     C = C / np.where(rows > 0, rows, 1.0)

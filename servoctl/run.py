@@ -11,8 +11,11 @@ from servoctl import archive
 from servoctl.checks import antiderivative, finite, named, rows_read, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
+from servoctl.model.equations import residual_names, signal_groups
+from servoctl.model.jets import extended, jet_names_to
 from servoctl.model.start import State, without_rounding
 from servoctl.model.switching import switching
+from servoctl.model.variants import place_of, variant_at
 from servoctl.units import unit_of
 from servoctl.values import Value, frozen, read_only, same
 
@@ -213,7 +216,7 @@ class Run(Sampled, Value):
     @property
     def _groups(self):
         """The model's group of each signal; none for a loaded run, whose signals are all stored."""
-        return self.model.signal_groups if self.model is not None else {}
+        return signal_groups(self.model.reduction) if self.model is not None else {}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -259,7 +262,7 @@ class Run(Sampled, Value):
             names, f = model.signals(kind, rate)
             jets = self.jets[: f.n_x, first:end]
             if f.n_x > len(jets) and not rate:  # outputs of higher order than the motion
-                jets = model.extended(self.t[first:end], jets, f.n_x)
+                jets = extended(model, self.t[first:end], jets, f.n_x)
             if f.n_x > len(jets):
                 present, needed = ((size - model.nq) // model.n for size in (len(self.jets), f.n_x))
                 raise SpecificationError(
@@ -349,7 +352,7 @@ class Run(Sampled, Value):
         nq, n = model.nq, model.n
         top = (len(jets) - nq) // n
         levels = [jets[nq + k * n : nq + (k + 1) * n] for k in range(top)]
-        plain = "coordinate_rates" not in model.signal_groups.values()
+        plain = "coordinate_rates" not in signal_groups(model.reduction).values()
         rates = levels if plain else self._coordinate_rates([i, j])
         q = BPoly.from_derivatives(ends, np.stack([jets[:nq], *rates], axis=1).transpose(2, 1, 0))
         if plain:
@@ -495,7 +498,7 @@ class Run(Sampled, Value):
     def _computed(self, residuals):
         """The branch of a flat program's solution, what the method counted, and all residuals."""
         if self.start is not None and self.model is not None and self.model.flat:
-            q = (f"{name} = {self.start[name]:.4g}" for name in self.model.coordinate_names)
+            q = (f"{name} = {self.start[name]:.4g}" for name in self.model.reduction.mechanism.q.names)
             yield f"branch of {', '.join(q)} at t = {self.start.t:g} s"
         yield ", ".join(f"{name} {count}" for name, count in self.counters.items() if count)
         yield f"largest residuals over all levels: {', '.join(residuals)}" * bool(residuals)
@@ -518,7 +521,8 @@ class _Residuals(Mapping):
         return f"Residuals({', '.join(self._names())})"
 
     def _names(self):
-        return list(self._run.stored_residual) if self._run.model is None else list(self._run.model.residual_names)
+        run = self._run
+        return list(run.stored_residual if run.model is None else residual_names(run.model.reduction))
 
     def __iter__(self):
         return iter(self._names())
@@ -547,7 +551,7 @@ def _facts_of_start(start):
 
 def _facts_of_model(run):
     """Parameters of a run's model; of its variants the places near which pivots were chosen, and sides of switches."""
-    variants = [(first, end, variant.place, sides(run.model, variant)) for first, end, variant in run.variants]
+    variants = [(first, end, place_of(variant), sides(run.model, variant)) for first, end, variant in run.variants]
     return {"parameters": run.model.numbers, "variants": variants}
 
 
@@ -587,14 +591,16 @@ def of_model(run, facts, model):
             do="Pass the value of sv.derive(mechanism, program).",
             model=type(model).__name__,
         )
-    numbers, names = facts.get("parameters"), model.names_to(len(run.jets))
+    numbers, names = facts.get("parameters"), jet_names_to(model, len(run.jets))
     off = {name: (value, model.numbers.get(name)) for name, value in (numbers or {}).items()}
     off = {name: pair for name, pair in off.items() if pair[0] != pair[1]}
     if numbers is None or off or numbers.keys() != model.numbers.keys():
         raise _other_model("parameters", off or (None if numbers is None else sorted(numbers)))
-    if run.jet_names != names or list(run.residual) != list(model.residual_names):
+    if run.jet_names != names or list(run.residual) != list(residual_names(model.reduction)):
         raise _other_model("names", [*run.jet_names, *run.residual])
-    variants = tuple((first, end, on_side(model, tuple(b)).at(place)) for first, end, place, b in facts["variants"])
+    variants = tuple(
+        (first, end, variant_at(on_side(model, tuple(b)), place)) for first, end, place, b in facts["variants"]
+    )
     events = {name: replace(at, model=model) for name, at in run.events.items()}
     full = replace(run, model=model, variants=variants, events=events, stored={}, stored_residual={})
     for of_file, of_model, what in ((run.stored, full, "signals"), (run.stored_residual, full.residual, "residuals")):

@@ -47,7 +47,9 @@ from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
-from servoctl.model.model import Model
+from servoctl.model.equations import invariant_names
+from servoctl.model.jets import extended, jet_names_to, with_highest
+from servoctl.model.model import Model, including, knots_within
 from servoctl.model.start import State
 from servoctl.model.switching import switching
 from servoctl.plants.driven import driven
@@ -219,9 +221,11 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     method, drift = _method_and_drift(model, method, drift, t0, t1)
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, Poles)
     x0 = as_state(model, start, t0) if leads_back else consistent_state(model, start, t0, isinstance(drift, Project))
-    knots = model.require_smooth((min(span), max(span)))
+    forward = min(span), max(span)
+    knots = knots_within(model, forward)
     if not isinstance(method, Algebraic):
-        knots = tuple(sorted({*knots, *model.ends_of_pieces((min(span), max(span))).tolist()}))
+        ends = model.reduction.switches.ends_of_pieces(model.parameters, forward)
+        knots = tuple(sorted({*knots, *ends.tolist()}))
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:
@@ -339,7 +343,7 @@ def _model_and_start(model, start, inputs):
             "sv.simulate(sv.plant(mechanism), x0, t_span, inputs={...}).",
             type=type(model).__name__,
         )
-    return model.including(names_of(start)), start
+    return including(model, names_of(start)), start
 
 
 def _tolerant(model, method, drift, problem, bar):
@@ -439,9 +443,9 @@ def _run(model, motion, settings, start, t1):
     facts["variants"] = tuple(motion.variants())
     if isinstance(method, Taylor):
         _set_at_knots(t, jets, facts["variants"], knots)
-    facts["events"] = occurrences(motion.occurrences, model.names_to)
+    facts["events"] = occurrences(motion.occurrences, partial(jet_names_to, model))
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
-    return Run(t, jets, model.names_to(len(jets)), model, start=start, **facts)
+    return Run(t, jets, jet_names_to(model, len(jets)), model, start=start, **facts)
 
 
 def _set_at_knots(t, jets, variants, knots):
@@ -454,9 +458,9 @@ def _set_at_knots(t, jets, variants, knots):
         at = first + np.flatnonzero(near.any(axis=0))
         if len(at):
             top = len(model.jet_names)
-            jets[:top, at] = model.with_highest(t[at], jets[: len(model.state_names), at])
+            jets[:top, at] = with_highest(model, t[at], jets[: len(model.state_names), at])
             if len(jets) > top:
-                jets[:, at] = model.extended(t[at], jets[:top, at], len(jets))
+                jets[:, at] = extended(model, t[at], jets[:top, at], len(jets))
 
 
 def _resample(run, times):
@@ -473,7 +477,7 @@ def _resample(run, times):
         inside = np.flatnonzero((steps >= first) & (steps < end))  # the variant of a step's end holds within the step
         if len(inside):
             a, b, n_x = int(inside[0]), int(inside[-1]) + 1, len(variant.state_names)
-            rates, highest = variant.with_highest(times[a:b], jets[:n_x, a:b])[n_x:], jets[n_x : n_x + variant.n, a:b]
+            rates, highest = with_highest(variant, times[a:b], jets[:n_x, a:b])[n_x:], jets[n_x : n_x + variant.n, a:b]
             highest[:] = np.where(np.isfinite(highest), rates, highest)
             variants.append((a, b, variant))
     return replace(run, t=times, jets=jets, variants=tuple(variants))
@@ -536,7 +540,7 @@ def _as_started(model, start, t, x):
 
 def _scaled_residuals(model, t, x):
     """Names of the invariants, their values, and these relative to their gradients times the state."""
-    names = [name for _, name in model.invariant_names()]
+    names = [name for _, name in invariant_names(model)]
     y = model.function("invariants")(t, x, model.parameters)
     values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names))
     square = (1.0 + np.abs(x)) ** 2 @ slopes**2

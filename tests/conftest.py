@@ -26,6 +26,7 @@ import servoctl as sv
 from servoctl.codegen import compiler, function
 from servoctl.gallery import gallery
 from servoctl.model.model import derive
+from servoctl.model.variants import derived_near
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
 with warnings.catch_warnings():  # of a CC that names no program
@@ -161,7 +162,7 @@ def motion(model, t=0.0, guess=None, **held):
     n_x = len(state.values)
     rates = model.function("ode")(t, state.values, model.parameters)[:n_x]
     if not np.all(np.isfinite(rates)):
-        near = model.near(t, np.append(state.values, np.zeros(model.n)))
+        near = derived_near(model, t, np.append(state.values, np.zeros(model.n)))
         rates = near.function("ode")(t, state.values, model.parameters)[:n_x]
     return np.append(state.values, rates[-model.n :])
 

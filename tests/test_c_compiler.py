@@ -16,6 +16,7 @@ from servoctl.codegen import cache, compiler
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import GRID_POINTS, compiled
 from servoctl.gallery import gallery
+from servoctl.model.equations import signal_groups
 from servoctl.shell.main import main
 
 
@@ -115,7 +116,7 @@ def test_a_repeated_simulation_has_the_same_bits(fresh, name, method):
 
     def motion():
         run = sv.simulate(model, start, (0.0, 0.3), method, t_eval=np.linspace(0.0, 0.3, 40), progress=False)
-        return [run.jets, *(run[signal] for signal in model.signal_groups)]
+        return [run.jets, *(run[signal] for signal in signal_groups(model.reduction))]
 
     first = motion()
     sv.simulate(model, start, (0.0, 0.2), t_eval=np.linspace(0.0, 0.2, 700), progress=False)

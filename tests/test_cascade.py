@@ -13,6 +13,7 @@ from refusals import refused
 
 import servoctl as sv
 from servoctl.gallery import cars, gallery
+from servoctl.model.jets import extended
 from servoctl.reduction import triangular
 
 SPAN = (0.0, 2.0)
@@ -169,7 +170,7 @@ def test_a_deep_plan_takes_few_operations_and_agrees_with_series(name):
     few = sv.derive(*build(N // 2)).function("path").operations
     model = sv.derive(*build(N))
     run = sv.simulate(model, model.start(), SPAN, t_eval=TIMES)
-    assert model.flat and model.operations()["path"] <= min(most, few * (N / (N // 2)) ** 3.2)
+    assert model.flat and model.function("path").operations <= min(most, few * (N / (N // 2)) ** 3.2)
     for signal, values in reference(N).items():
         assert np.abs(run[signal] - values).max() < 1e-11 * np.abs(values).max(), signal
     assert sv.verify(run).passed
@@ -269,7 +270,7 @@ def test_starts_structure_and_higher_jets_agree(name, pairs):
     assert [getattr(structures[0], part) for part in parts] == [getattr(structures[1], part) for part in parts]
     run = moved(by_expressions)
     size = len(run.jets) + 2 * by_blocks.n
-    jets = [model.extended(run.t, run.jets, size) for model in (by_blocks, by_expressions)]
+    jets = [extended(model, run.t, run.jets, size) for model in (by_blocks, by_expressions)]
     known = np.isfinite(jets[1])
     assert np.abs(jets[0] - jets[1])[known].max() < 1e-8 * np.abs(jets[1][known]).max()
 

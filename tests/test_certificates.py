@@ -11,6 +11,7 @@ from scenes import CERTIFIED
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
+from servoctl.model.equations import leading_names
 
 STOPS = {"appell-hamel-squared": 0.6983110523, "constant-speed-horizontal": 5.0 / 9.81}  # s: the others reach their end
 FLAT = (
@@ -68,7 +69,7 @@ def worst_of_3_18(run):
         n, jets = model.n, run.jets[:, k]
         x = jets[: len(model.state_names)]
         matrices = model.function("matrices")(run.t[k], x, model.parameters)
-        rows = len(model.leading_names()[0])
+        rows = len(leading_names(model.reduction)[0])
         T = null_space(matrices[rows * n : -n].reshape(n, -1).T)
         worst = max(worst, np.abs(T.T @ balance[:, k]).max(initial=0.0))
     return worst / np.abs(balance).max()

@@ -239,7 +239,7 @@ def test_wrong_poles_are_refused(values, error, fact, rod):
 
 def test_poles_per_row(rod):
     model, start = rod
-    assert model.raised["rod"] == 2 and model.raised["cart"] == 2
+    assert model.reduction.raised["rod"] == 2 and model.reduction.raised["cart"] == 2
     run = sv.simulate(model, start, (0.0, 5.0), drift=sv.methods.Poles({"rod": [-3.0 + 1.0j, -3.0 - 1.0j]}))
     assert run.success and "rod" in run.drift
     assert max(by_quarters(run)) < 1e-6

@@ -114,7 +114,7 @@ def test_feedforward_of_internal_dynamics_is_the_runge_kutta_run(name, gallery_m
         run = sv.simulate(model, start, (0.0, end), method=sv.methods.RungeKutta(4, step=end / steps))
     with warned("plan_advance", "hyperbolic", "15.04") if name == "vtol-centre" else contextlib.nullcontext():
         plan = exported(model, tmp_path, start=start)
-    names, _ = model.signals("reaction" if model.ideal else "actuation")
+    names, _ = model.signals("reaction" if model.reduction.ideal else "actuation")
     x, p = start.values.copy(), model.parameters
     z, u = np.empty(len(model.jet_names)), np.empty(len(names))
     assert len(run.t) == steps + 1

@@ -9,6 +9,7 @@ from refusals import refused, warned
 
 import servoctl as sv
 from servoctl.gallery import gallery
+from servoctl.model.model import including
 from servoctl.reduction.idle import needed
 
 SPAN = (0.0, 8.0)
@@ -56,12 +57,12 @@ def beside():
 def test_a_crane_beside_200_pendulums_is_the_crane(alone):
     model = sv.derive(*crane(200))
     run, (_, model_alone, run_alone) = planned(model), alone
-    assert len(model.left_out) == 200 and "200 coordinates" in repr(model)
+    assert len(model.reduction.left_out) == 200 and "200 coordinates" in repr(model)
     assert run.jet_names == run_alone.jet_names and np.array_equal(run.jets, run_alone.jets)
     for name in ("trolley", "hoist", "energy"):
         assert np.array_equal(run[name], run_alone[name])
     assert all(np.array_equal(run.residual[name], run_alone.residual[name]) for name in run_alone.residual)
-    assert model.operations() == model_alone.operations()
+    assert model.function("path").operations == model_alone.function("path").operations
     assert repr(model).splitlines()[2:] == repr(model_alone).splitlines()[1:]
 
 
@@ -98,7 +99,7 @@ def test_two_of_twenty_pendulums_are_a_flat_plan():
     targets = [sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4) * k for k in (1, 2)]
     program = sv.Program({"A": q.d(0)[0] - targets[0], "B": q.d(0)[1] - targets[1]})
     model = sv.derive(mechanism, program)
-    assert model.flat and model.coordinate_names == ("a0", "a1") and len(model.left_out) == 18
+    assert model.flat and model.reduction.mechanism.q.names == ("a0", "a1") and len(model.reduction.left_out) == 18
     run = sv.simulate(model, model.start(), (0.0, 2.0))
     assert np.abs(run["m0"] - (run["d2a0"] / 2 + 9.81 * np.sin(run["a0"]))).max() < 1e-12
     assert sv.derive(mechanism, program, keep=q.names).free == 36
@@ -130,13 +131,13 @@ WHOLE = {
 @pytest.mark.parametrize("what", WHOLE)
 def test_what_is_driven_reported_coupled_or_named_is_not_left_out(what):
     (mechanism, program), options = WHOLE[what]
-    assert sv.derive(mechanism, program, **options).left_out == ()
+    assert sv.derive(mechanism, program, **options).reduction.left_out == ()
 
 
 def test_one_of_two_is_restored_by_name():
     mechanism, program = crane(2, outputs=("end1",))
-    assert sv.derive(mechanism, program).left_out == ("phi0",)
-    assert sv.derive(*crane(2), keep="phi0").left_out == ("phi1",)
+    assert sv.derive(mechanism, program).reduction.left_out == ("phi0",)
+    assert sv.derive(*crane(2), keep="phi0").reduction.left_out == ("phi1",)
 
 
 ABSENT = {
@@ -164,7 +165,7 @@ def test_a_start_that_names_a_coordinate_includes_it(beside, named):
     start = model.start(**{"guess": {"l": 4.0}} | named)
     with warned("unstable"):
         swung = sv.simulate(model, start, (0.0, 2.0))
-    assert swung.model.left_out == () and swung["phi0"][-1] > 0.5
+    assert swung.model.reduction.left_out == () and swung["phi0"][-1] > 0.5
     assert swung["hoist"] == pytest.approx(np.interp(swung.t, run.t, run["hoist"]), abs=1e-2)
     assert sv.internal_dynamics(swung).verdict == "unstable" and sv.verify(swung).passed
     assert sv.report(swung).verdict.startswith("non-minimum phase")
@@ -172,7 +173,7 @@ def test_a_start_that_names_a_coordinate_includes_it(beside, named):
     assert np.any([*sv.sensitivity(swung, to=["phi0"], of=["d2phi0"]).values.values()])
     many = sv.simulate_many(model, {"l": 4.0, "phi0": [0.1, 0.2]}, None, (0.0, 0.5)) if "phi0" in named else None
     assert many is None or many["final phi0"].min() > 0.1
-    assert model.including(["phi0"]).including(["phi0"]).left_out == () and model.left_out == ("phi0",)
+    assert including(including(model, ["phi0"]), ["phi0"]).reduction.left_out == () and model.reduction.left_out == ("phi0",)
 
 
 def test_keep_names_coordinates():
@@ -183,7 +184,7 @@ def test_keep_names_coordinates():
 def test_a_model_without_a_pendulum_pickles(beside):
     _, model, run = beside
     copy = pickle.loads(pickle.dumps(model))
-    assert copy == model and copy.left_out == ("phi0",) and np.array_equal(planned(copy).jets, run.jets)
+    assert copy == model and copy.reduction.left_out == ("phi0",) and np.array_equal(planned(copy).jets, run.jets)
 
 
 def test_other_formulations_are_parted_alike():
@@ -203,14 +204,14 @@ def test_other_formulations_are_parted_alike():
         sv.Mechanism(q, balance=r, actuators=push, constraints=rod),
     ):
         model = sv.derive(mechanism, program)
-        assert model.left_out == ("y", "X", "Z") and model.flat
+        assert model.reduction.left_out == ("y", "X", "Z") and model.flat
         run = sv.simulate(model, model.start(), (0.0, 1.0))
         assert np.abs(run["push"] - 2 * np.sin(run.t)).max() < 1e-12
     rates = w.d(1)
     coupled = sv.Mechanism(w, kinetic=sum(m * rate**2 for m, rate in zip((2, 3, 1, 1), rates, strict=True)) / 2,
                            actuators=push, constraints=rod)  # fmt: skip
     model = sv.derive(coupled, program)
-    assert model.left_out == ("X", "Z") and model.reduction.mechanism.q.velocity_names == ("u", "v")
+    assert model.reduction.left_out == ("X", "Z") and model.reduction.mechanism.q.velocity_names == ("u", "v")
 
 
 @pytest.mark.parametrize(

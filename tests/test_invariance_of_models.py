@@ -10,8 +10,9 @@ from conftest import motion, signal
 import servoctl as sv
 from servoctl.errors import ServoError
 from servoctl.gallery import gallery, mass_on_car, overhead_crane, winch_crane
-from servoctl.model.model import derive
+from servoctl.model.model import derive, knots_within
 from servoctl.model.validity import affirmed
+from servoctl.model.variants import derived_near
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.knots import Switches
 from servoctl.reduction.reduce import holds
@@ -283,7 +284,7 @@ def test_a_model_near_a_state_is_the_same_model(name, gallery_model):
     """Pivots chosen again for one state of the motion: same orders, same accelerations, same actuation."""
     (held, guess), model, t = start_of(name), gallery_model(name), 0.3
     jets = motion(model, t, guess=guess, **held)
-    near = model.near(t, jets)
+    near = derived_near(model, t, jets)
     assert orders(near) == orders(model)
     kind = "actuation" if model.reduction.program.by == "actuators" else "reaction"
     expected = signal(model, kind, t, jets)
@@ -297,7 +298,7 @@ def test_a_model_near_a_state_is_the_same_model(name, gallery_model):
 def test_a_start_where_a_pivot_vanishes_gets_pivots_of_its_own(name, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     state = model.start(0.0, guess=scene.guess, **scene.start)
-    near = model.near(0.0, np.append(state.values, np.zeros(model.n)))
+    near = derived_near(model, 0.0, np.append(state.values, np.zeros(model.n)))
     rates = near.function("ode")(0.0, state.values, model.parameters)[: len(state.values)]
     assert np.all(np.isfinite(rates))
     reaction = signal(near, "reaction", 0.0, np.append(state.values, rates[-model.n :]))
@@ -359,4 +360,4 @@ def test_a_run_after_new_numbers_takes_the_knots_that_are_known(monkeypatch):
     model = derive(*overhead_crane())
     other = model.with_parameters(m_load=1.1 * model.numbers["m_load"])
     monkeypatch.setattr(Switches, "classes", lambda *_: pytest.fail("classes are known"))
-    assert other.knots == model.knots and tuple(other.require_smooth((0.0, 9.0))) == model.knots
+    assert other.knots == model.knots and tuple(knots_within(other, (0.0, 9.0))) == model.knots

@@ -9,7 +9,7 @@ from refusals import refused
 import servoctl as sv
 from servoctl.errors import SpecificationError
 from servoctl.gallery import cars, overhead_crane
-from servoctl.model.model import derive
+from servoctl.model.model import derive, knots_within
 
 
 def follower(path):
@@ -193,7 +193,7 @@ def test_switches_that_are_not_affine_are_found_within_a_span(span):
     """t² = 4 at t = 2, wherever the scan's own grid happens to lie."""
     model = follower(lambda t, p: ca.if_else(t**2 < 4, 0, (t - 2) ** 3))
     with refused(SpecificationError, has=2, t=2.0):
-        model.require_smooth(span)
+        knots_within(model, span)
 
 
 def test_a_switch_between_knots_is_found_wherever_it_lies():
@@ -253,4 +253,4 @@ def test_remembered_knots_are_those_of_their_numbers_and_span():
         for h in (0.5, 0.6):
             for end in (2.0, 9.0, 5.0):
                 other = model.with_parameters(h=h, m=1.0 + h)
-                assert other.require_smooth((0.0, end)) == pytest.approx(crossings(h, end), abs=4e-15)
+                assert knots_within(other, (0.0, end)) == pytest.approx(crossings(h, end), abs=4e-15)

@@ -11,6 +11,7 @@ import servoctl as sv
 from servoctl.errors import LimitExceeded, NameUnknown, SingularProgram, SpecificationError
 from servoctl.figures.work_precision import COLOURS
 from servoctl.gallery import gallery
+from servoctl.model.model import including
 from servoctl.study.tradeoff import ERRORS
 
 # --- scenes, each with a parameter that its reference has more than its simple level
@@ -238,7 +239,7 @@ def test_coordinates_that_play_no_part_are_compared_on_demand():
     mechanism = sv.Mechanism(q, S, potential=2 * y**2, actuators={"u": x})
     model = sv.derive(mechanism, sv.Program({"x": x - path}, by="actuators"))
     assert "y" not in sv.tradeoff(model, model.start(), (0.0, 1.0)).meta["outputs"]
-    whole = model.including(["y"])
+    whole = including(model, ["y"])
     study = sv.tradeoff(whole, whole.start(y=0.1), (0.0, 1.0), {"Taylor": 1e-9}, "project", outputs=["x", "y"])
     assert study.meta["outputs"] == ["x", "y"] and study["error"][0] < 1e-8
 

@@ -6,6 +6,7 @@ import pytest
 import servoctl as sv
 from servoctl.methods.motion import Motion
 from servoctl.methods.watch import Residuals
+from servoctl.model.variants import place_of, variant_at
 
 
 def added(room, pieces):
@@ -74,18 +75,19 @@ def test_a_projected_motion_that_keeps_its_residuals_needs_no_slopes_of_them(met
 
 def test_motions_from_one_start_derive_their_variants_once(monkeypatch):
     from servoctl.gallery import gallery
-    from servoctl.model import model as models
+    from servoctl.model.model import Model
+    from servoctl.model.variants import MOST_VARIANTS
 
     scene = gallery["spiral"]
     model = sv.derive(*scene.build())
     start = model.start(guess=scene.guess, **scene.start)
-    derived, places = models._derived, []
-    monkeypatch.setattr(models, "_derived", lambda *given: places.append(given[3]) or derived(*given))
+    derived, places = Model._of, []
+    monkeypatch.setattr(Model, "_of", lambda *given: places.append(given[3]) or derived(*given))
     runs = [sv.simulate(model, start, scene.t_span, sv.methods.RungeKutta(4, step=1e-2)) for _ in range(2)]
     assert len(places) == runs[0].counters["pivot_changes"] > 0
     assert np.array_equal(*(run.jets for run in runs))
     assert runs[0].variants[-1][2] is runs[1].variants[-1][2]
-    place = runs[0].variants[-1][2].place
-    for k in range(models.MOST_VARIANTS):
-        model.at((1e-3 * (k + 1), *place[1:]))
-    assert model.at(place) is not runs[0].variants[-1][2] and model.at(place) == runs[0].variants[-1][2]
+    place = place_of(runs[0].variants[-1][2])
+    for k in range(MOST_VARIANTS):
+        variant_at(model, (1e-3 * (k + 1), *place[1:]))
+    assert variant_at(model, place) is not runs[0].variants[-1][2] and variant_at(model, place) == runs[0].variants[-1][2]

@@ -130,7 +130,7 @@ def test_error_dynamics_backwards_in_time(method, scene):
     there = end.jets[: len(start.values), -1]
     with refused(sv.errors.SpecificationError, "'project'", row="x_c"):
         sv.simulate(model, there, SPAN[::-1], method=method, drift=0.05)
-    growing = sv.methods.Poles({row: [20.0] * count for row, count in model.raised.items() if count})
+    growing = sv.methods.Poles({row: [20.0] * count for row, count in model.reduction.raised.items() if count})
     back = sv.simulate(model, there, SPAN[::-1], method=method, drift=growing)
     assert back.jets[: len(there), -1] == pytest.approx(start.values, abs=1e-7)
 

@@ -14,6 +14,8 @@ from servoctl.methods.monitor import Monitor
 from servoctl.methods.taylor import series_loop
 from servoctl.model import model as models
 from servoctl.model import store
+from servoctl.model.pivots import pivot_strength
+from servoctl.model.variants import derived_near, place_of, with_diagonal_pivots
 
 
 def arm(program, by="actuators", unit=1.0, weights=None, order=0, constraint=None):
@@ -76,7 +78,7 @@ def counted(monkeypatch, tmp_path):
 @pytest.mark.parametrize("which", ARMS)
 def test_pivots_of_definite_matrices_give_the_same_motion(which):
     model, start = begun(which)
-    other, p, x = model.without_choice, model.parameters, start.values
+    other, p, x = with_diagonal_pivots(model), model.parameters, start.values
     one, two = (m.function("ode")(start.t, x, p)[: len(x)] for m in (model, other))
     assert relative(one, two) < 1e-10
     one, two = (series_loop(m, 6)(start.t, x, np.append(p, start.t))[: 6 * model.n] for m in (model, other))
@@ -97,8 +99,8 @@ def test_where_actuators_reach_every_balance_no_pivot_chooses_among_these():
 def test_error_dynamics_are_the_same_with_them(which):
     model, start = begun(which)
     x = start.values + 1e-3 * np.cos(np.arange(len(start.values)))
-    p = np.append(model.parameters, np.full(sum(model.raised.values()), 3.0))
-    one, two = (m.function("ode_poles")(start.t, x, p)[: len(x)] for m in (model, model.without_choice))
+    p = np.append(model.parameters, np.full(sum(model.reduction.raised.values()), 3.0))
+    one, two = (m.function("ode_poles")(start.t, x, p)[: len(x)] for m in (model, with_diagonal_pivots(model)))
     assert relative(one, two) < 1e-10
 
 
@@ -167,11 +169,11 @@ def test_runs_with_other_pivots_are_saved_and_pickled(which, tmp_path):
     run = sv.simulate(model, start, (0.0, 2.0), "DOP853")
     assert len(run.variants) > 1
     loaded = sv.load(run.save(tmp_path / "run"), model)
-    assert loaded == run and [v.place for *_, v in loaded.variants] == [v.place for *_, v in run.variants]
+    assert loaded == run and [place_of(v) for *_, v in loaded.variants] == [place_of(v) for *_, v in run.variants]
     variant = run.variants[-1][2]
     copy = pickle.loads(pickle.dumps(variant))
     x, p = start.values, model.parameters
-    assert copy == variant != model and copy.place == variant.place
+    assert copy == variant != model and place_of(copy) == place_of(variant)
     assert np.array_equal(copy.function("ode")(0.0, x, p), variant.function("ode")(0.0, x, p))
 
 
@@ -199,16 +201,16 @@ def test_parameters_change_with_other_pivots():
     mechanism = sv.Mechanism(q, sv.particle(q, p.m, ca.vertcat(*q)), 9.81 * p.m * q.jet(0)[2], parameters=p)
     program = sv.Program({"rod": ca.sumsqr(ca.vertcat(*q)) - p.l**2}, by="ideal")
     model = sv.derive(mechanism, program)
-    other = model.without_choice.with_parameters(l=2.0)
+    other = with_diagonal_pivots(model).with_parameters(l=2.0)
     start = model.with_parameters(l=2.0).start(x=2.0, dz=1.0, dy=0.5)
     rates = other.function("ode")(0.0, start.values, other.parameters)
-    assert other.diagonal and rates[3:6] == pytest.approx([-1.25 / 2, 0.0, -9.81], abs=1e-12)
+    assert other.equations.definite and rates[3:6] == pytest.approx([-1.25 / 2, 0.0, -9.81], abs=1e-12)
 
 
 def test_matrices_that_are_not_definite_have_no_such_pivots():
     """A crane's residuals lie across its actuators; an arm's torques as many as residuals; a plan integrates nothing."""
     for name in ("overhead-crane", "vtol-centre", "spiral"):
-        assert sv.derive(*gallery[name].build()).without_choice is None
+        assert sv.derive(*with_diagonal_pivots(gallery[name].build())) is None
     assert sv.derive(*two_links(1)).without_choice is None
 
 
@@ -245,7 +247,7 @@ def test_blocks_and_hidden_rows_change_their_pivots(stages, order, derived, coun
     assert len({id(variant) for *_, variant in run.variants}) <= 4
     assert sv.verify(run).passed
     loaded = sv.load(run.save(tmp_path / "run"), model)
-    assert loaded == run and [v.place for *_, v in loaded.variants] == [v.place for *_, v in run.variants]
+    assert loaded == run and [place_of(v) for *_, v in loaded.variants] == [place_of(v) for *_, v in run.variants]
     again = sv.simulate(model, start, (0.0, 12.0), method)
     assert counted["derived"] == derived and np.array_equal(run.jets, again.jets)
 
@@ -287,11 +289,11 @@ def test_a_variant_that_does_not_serve_other_parameters_is_derived_with_these(sl
     mechanism = sv.Mechanism(q, sv.particle(q, p.m, ca.vertcat(x, y)), 9.81 * p.m * y, parameters=p)
     model = sv.derive(mechanism, sv.Program({"bar": ca.sin(x) + p.slope * y * (1.0 + x**2)}, by="ideal"))
     jets = np.zeros(len(model.jet_names))
-    model.near(0.0, jets)
+    derived_near(model, 0.0, jets)
     counted["derived"] = 0
     other = model.with_parameters(slope=slope)
-    near = other.near(0.0, jets)
-    assert counted["derived"] == derived and near.strength(0.0, jets) > 0.3
-    assert near is other.near(0.0, -jets)  # the sign of a zero is no other place
+    near = derived_near(other, 0.0, jets)
+    assert counted["derived"] == derived and pivot_strength(near, 0.0, jets) > 0.3
+    assert near is derived_near(other, 0.0, -jets)  # the sign of a zero is no other place
     rates = near.function("ode")(0.0, jets[: len(model.state_names)], near.parameters)
     assert rates[2:4] == pytest.approx(9.81 / (1 + slope**2) * np.array([slope, -1.0]), rel=1e-12)

@@ -14,6 +14,7 @@ import servoctl as sv
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.gallery import cars, gallery, mass_on_car, overhead_crane, passive_arm, spiral
 from servoctl.methods.choice import Adaptive
+from servoctl.model.equations import invariant_names
 from servoctl.model.model import derive
 from servoctl.reduction import hidden
 from servoctl.simulation import simulate
@@ -111,9 +112,9 @@ def test_orders_free_values_and_needs_of_the_gallery(name, gallery_model):
     model, (final, needs) = gallery_model(name), GALLERY[name]
     assert orders(model) == final
     assert model.free == sum(final) + ROLLED.get(name, 0) and model.flat == (model.free == 0)
-    assert model.free == len(model.state_names) - len(model.invariant_names())
+    assert model.free == len(model.state_names) - len(invariant_names(model))
     assert {key: model.reduction.needs[key] for key in needs} == needs
-    assert sum(model.raised.values()) == model.reduction.top * model.n - sum(final)
+    assert sum(model.reduction.raised.values()) == model.reduction.top * model.n - sum(final)
 
 
 def test_where_velocities_alone_are_determined_the_motion_is_integrated():

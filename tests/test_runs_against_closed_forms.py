@@ -14,6 +14,7 @@ from scipy.optimize import brentq, minimize_scalar
 import servoctl as sv
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 from servoctl.methods.choice import as_method
+from servoctl.model.equations import invariant_names
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13}
 
@@ -36,7 +37,7 @@ def internal_poles(model, state):
     step = 1e-6 * (1.0 + np.abs(x))
     ends = [[f(state.t, x + s * step[i] * e, p)[:n] for s in (1, -1)] for i, e in enumerate(np.eye(n))]
     matrix = np.array([(a - b) / (2 * h) for (a, b), h in zip(ends, step, strict=True)]).T
-    m = len(model.invariant_names())
+    m = len(invariant_names(model))
     jacobian = invariants(state.t, x, p)[m:].reshape(n, m).T
     tangent = np.linalg.svd(jacobian)[2][np.linalg.matrix_rank(jacobian) :].T
     return np.sort_complex(np.linalg.eigvals(tangent.T @ matrix @ tangent))

@@ -13,6 +13,7 @@ from scipy.integrate import trapezoid
 import servoctl as sv
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.gallery import gallery
+from servoctl.model.equations import signal_groups
 
 NUMBERS = {"m_trolley": 10.0, "m_hoist": 5.0, "m_load": 100.0, "g": 9.81}
 
@@ -85,7 +86,7 @@ def test_scenes_against_differences(name, gallery_model):
 
     start_guess = dict(zip(start.names, start.values, strict=True))
     motion = sv.simulate(model, start, span, method, t_eval=times)
-    of = [*model.jet_names, *model.signal_groups]
+    of = [*model.jet_names, *signal_groups(model.reduction)]
     s = sv.sensitivity(motion, of, [*model.numbers, *(n for n in start.held if n in model.state_names)])
     free = {n: start[n] for n in s.independent}
     for to in s.to:

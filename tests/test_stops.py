@@ -13,7 +13,6 @@ from scipy.integrate import solve_ivp
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.choice import as_method
-from servoctl.model.model import Model
 
 ADAPTIVE = ("RK45", "DOP853", "Radau", "LSODA", "Taylor")
 FIXED = ("RK4", "RK8")
@@ -258,8 +257,8 @@ def test_a_particle_goes_round_and_round(kind, method, derived):
 
 def derives_again(patch):
     """Changed pivots are those of rows that are derived again, as where no others solve the same rows."""
-    patch.setattr(Model, "without_choice", None)
-    patch.setattr(Model, "reordered", lambda *_: None)
+    patch.setattr("servoctl.methods.monitor.with_diagonal_pivots", lambda model: None)
+    patch.setattr("servoctl.methods.monitor.reordered_at", lambda *_: None)
 
 
 @pytest.mark.parametrize("method", ["DOP853", "Taylor"])
@@ -334,7 +333,7 @@ def test_where_no_other_pivots_are_found_the_motion_is_kept(method, derived, mon
     model = derived(led_round if method == "algebraic" else driven_pendulum)
     start = model.start(t=0.2, x=np.cos(0.4), y=np.sin(0.4))
     derives_again(monkeypatch)
-    monkeypatch.setattr(type(model), "near", none_found)
+    monkeypatch.setattr("servoctl.methods.monitor.derived_near", none_found)
     settings = {} if method == "algebraic" else precise(method)
     with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, start, (0.2, 4.0), as_method(method, **settings), t_eval=np.linspace(0.2, 4.0, 381))

@@ -249,7 +249,7 @@ def test_series_end_where_a_time_law_reaches_the_knots_of_a_table(monkeypatch):
     knots = np.linspace(0.0, 1.0, 12)[1:-1]
     first = np.arcsin((knots[np.abs(knots - 0.5) < 0.4] - 0.5) / 0.4)
     expected = np.sort([*(first % (2 * np.pi)), *(np.pi - first)])
-    np.testing.assert_allclose(model.ends_of_pieces((0.0, 2 * np.pi)), expected[expected <= 2 * np.pi], atol=1e-13)
+    np.testing.assert_allclose(model.reduction.switches.ends_of_pieces(model.parameters, (0.0, 2 * np.pi)), expected[expected <= 2 * np.pi], atol=1e-13)
 
 
 @pytest.mark.parametrize("law", [lambda t: t, lambda t: sv.paths.rest_to_rest(t, 0.0, 6.0, 6.0, 6)])

@@ -137,7 +137,7 @@ def test_parts_plants_and_loops_keep_units(plan, loop, tmp_path):
     q = sv.coordinates("x z idle", units="m m rad")
     two = sv.Mechanism(q, sum(sv.particle(q, 1.0, each) for each in q), actuators={"push": q["x"], "lift": q["z"]})
     model = sv.derive(two, sv.Program({"X": q["x"] - q.t**4, "Z": q["z"] - q.t**4}, by="actuators"))
-    assert "idle" not in model.coordinate_names and model.reduction.mechanism.units["push"] == "N"
+    assert "idle" not in model.reduction.mechanism.q.names and model.reduction.mechanism.units["push"] == "N"
     assert loop.units == plan.units == CRANE_UNITS and loop.unit("d2theta") == "rad/s^2"
     for value in (plan, loop):
         again = sv.load(value.save(tmp_path / "value.npz"))

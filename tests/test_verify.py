@@ -164,7 +164,7 @@ def test_what_is_right_passes(name):
 def test_rounding_of_nearly_dependent_rows_excuses_no_other_force(share, by):
     model, start, span = dependent(share, by)
     run = sv.simulate(model, start, span)
-    names, forces = run.signals("reaction" if model.ideal else "actuation")
+    names, forces = run.signals("reaction" if model.reduction.ideal else "actuation")
     for name, force in zip(names, forces, strict=True):
         stored = {name: force + 5e-6 * np.abs(forces).max()}
         assert "signals" in sv.verify(replace(run, stored=stored)).failures

@@ -13,6 +13,7 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError, unknown
 from servoctl.figures import style
 from servoctl.methods.choice import Taylor
+from servoctl.model.variants import derived_near
 from servoctl.reduction.ranks import clean, decide_all, eliminate
 from servoctl.simulation import consistent_state, simulate
 from servoctl.study.table import Study, machine
@@ -264,7 +265,7 @@ def _integrated(model, form, method, t, reference, first):
     f = servo_dae(model, form)
     rates = np.zeros(model.nq + model.n)
     if not np.all(np.isfinite(f(t[0], reference[:, 0], np.concatenate([model.parameters, [1.0], rates])))):
-        f = servo_dae(model.near(t[0], first), form)  # pivots of the projection vanish at the start
+        f = servo_dae(derived_near(model, t[0], first), form)  # pivots of the projection vanish at the start
     began = perf_counter()
     z, iterations = _march(f, model, METHODS[method], t, reference[:, 0])
     seconds = perf_counter() - began

@@ -178,7 +178,7 @@ def commands(name, run):
     said = "The first command writes a page with the machine in motion, the second prints the verdict on the program"
     if values:
         changed = min(values, key=lambda key: (key != "m_load", not key.lower().startswith(INERTIAS)))
-        planned = run.model.ideal or not run.success
+        planned = run.model.reduction.ideal or not run.success
         lines.append(f"servoctl run {name} {'--set' if planned else '--machine'} {changed}={1.2 * values[changed]:g}")
         said += ", the third " + ("moves" if planned else "lets a controller follow the plan on") + " another machine"
     return textwrap.fill(f"{said}.", WIDTH) + "\n\n" + "".join(f"    {line}\n" for line in lines)

@@ -154,7 +154,7 @@ def require_plan(plan, plant):
             samples=len(plan.t),
             t_span=(float(plan.t[0]), float(plan.t[-1])),
         )
-    if model.ideal:
+    if model.reduction.ideal:
         raise NotRealisable(
             "The plan is realised by an ideal reaction.",
             "A law commands actuators.",

@@ -21,6 +21,8 @@ from servoctl.control.nonlinear import solver, words
 from servoctl.errors import IntegrationStopped, SpecificationError, unknown
 from servoctl.methods.bounded import FreeEntries, subdivided
 from servoctl.methods.radau import radau
+from servoctl.model.equations import signal_groups
+from servoctl.model.jets import extended
 from servoctl.model.model import derived
 from servoctl.spec.paths import piecewise
 from servoctl.values import frozen
@@ -174,12 +176,11 @@ class Inverse:
         if name in model.jet_names:
             i = model.jet_names.index(name)
             return 0, ca.Function("jet", [e.q.t, e.jets, e.parameters], [e.jets[i]])
-        base, rate = (
-            (name, 0) if name in model.signal_groups else antiderivative(name, model.signal_groups) or (None, 0)
-        )
+        groups = signal_groups(model.reduction)
+        base, rate = (name, 0) if name in groups else antiderivative(name, groups) or (None, 0)
         if base is None:
-            raise unknown(name, [*model.jet_names, *model.signal_groups], "signal")
-        names, f = e.signals(model.signal_groups[base], rate)
+            raise unknown(name, [*model.jet_names, *groups], "signal")
+        names, f = e.signals(groups[base], rate)
         return names.index(name), f
 
 
@@ -262,7 +263,7 @@ class Problem:
         self.parts = (np.arange(self.count)[:, None] + self.c).ravel() / self.count  # of the duration, at nodes
         times = plan.t[0] + law.duration * np.append(0.0, self.parts)
         jets = np.array([np.interp(times, plan.t, row) for row in plan.jets])
-        jets = jets[:size] if len(jets) >= size else plan.model.extended(times, jets, size)
+        jets = jets[:size] if len(jets) >= size else extended(plan.model, times, jets, size)
         self.begin, self.z = jets[:, 0], jets[:, 1:]
         start = plan.jets[: len(plan.model.state_names), 0]
         self.free = [] if plan.model.flat else FreeEntries(plan.model, plan.t[0], start).free.tolist()

@@ -188,7 +188,7 @@ def _require_counted(contents):
 
 
 def _of_model(model, start):
-    actuation, control = model.signals("reaction" if model.ideal else "actuation")
+    actuation, control = model.signals("reaction" if model.reduction.ideal else "actuation")
     places, residual = model.signals("residuals")
     require_outputs(model.reduction)
     outputs, output = model.signals("outputs")
@@ -197,7 +197,7 @@ def _of_model(model, start):
     p = Array("p", "Parameters p, SI", model.reduction.mechanism.parameters.names, units)
     x = Array("x", "State x = (q, w, ...), SI", model.state_names, units)
     z = Array("z", "Jets z = (x, highest derivative), SI", model.jet_names, units)
-    u = Array("u", "Reaction u, SI" if model.ideal else "Actuation u, SI", actuation, units)
+    u = Array("u", "Reaction u, SI" if model.reduction.ideal else "Actuation u, SI", actuation, units)
     r = Array("r", "Residuals r, each with its time derivatives, SI", levels)
     y = Array("y", "Outputs y, SI", outputs, units)
     at = (TIME, z.input(), p.input())

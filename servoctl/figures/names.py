@@ -23,7 +23,7 @@ def efforts(run):
 def coordinates(run):
     """Names of the run's coordinates; for a loaded run of those whose derivatives are stored."""
     if run.model is not None:
-        return list(run.model.coordinate_names)
+        return list(run.model.reduction.mechanism.q.names)
     base = [name for name in run.jet_names if antiderivative(name, run.jet_names) is None]
     by_quasi_velocities = [name for name in base if f"d{name}" in run.stored]  # q' is then a signal, and no jet
     return by_quasi_velocities or base

@@ -316,7 +316,7 @@ def _linear_model(model, t, x, name):
     A = jacobian(ode, "x", t, x, p)[:n_x]
     z, to_jets = np.append(x, ode(t, x, p)[n_x - n : n_x]), np.vstack([np.eye(n_x), A[-n:]])
     require_outputs(model.reduction)
-    groups = [model.signals("reaction" if model.ideal else "actuation"), model.signals("outputs")]
+    groups = [model.signals("reaction" if model.reduction.ideal else "actuation"), model.signals("outputs")]
     C = [np.eye(n_x), *(jacobian(f, "x", t, z, p) @ to_jets for group, f in groups if group)]
     names = [*model.state_names, *(name for group, _ in groups for name in group)]
     C = np.vstack(C)

@@ -100,7 +100,7 @@ def _model(model, name):
 
     n, n_x, p = model.n, len(model.state_names), model.parameters
     require_outputs(model.reduction)
-    groups = [model.signals("reaction" if model.ideal else "actuation"), model.signals("outputs")]
+    groups = [model.signals("reaction" if model.reduction.ideal else "actuation"), model.signals("outputs")]
     names = [name for group, _ in groups for name in group]
     ode, symbols = model.function("ode"), model.reduction.mechanism.parameters.names
 
@@ -110,7 +110,7 @@ def _model(model, name):
             raise ServoError(
                 f"The reduced dynamics is not finite at t = {t:.6g} s.",
                 "A pivot of the model vanishes here; sv.simulate would choose others.",
-                do="Use model.near(t, jets), whose pivots are those of a state near by.",
+                do="Derive the model with guess={...}, a state near by: its pivots are chosen there.",
                 t=float(t),
             )
         return y

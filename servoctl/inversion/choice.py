@@ -156,7 +156,7 @@ class Request:
         try:
             run = self.exact(model, begin, found, chosen)
         except (IntegrationStopped, SingularProgram) as error:
-            if model.ideal:
+            if model.reduction.ideal:
                 raise
             run = getattr(error, "run", None)
             after = found if run is None else verdict(model, run)
@@ -170,7 +170,7 @@ class Request:
         if excess:
             return self.relaxed(excess, begin)
         after = verdict_with(model, found, run)
-        if after.dynamics == GROWS and not model.ideal:
+        if after.dynamics == GROWS and not model.reduction.ideal:
             return self.relaxed(after, begin, moving=found.dynamics != MARGINAL)
         if after.dynamics == GROWS:
             warn(f"An ideal program has no other inverse, and this is {after}.")
@@ -312,7 +312,7 @@ def _swinging(run):
     if name is None or parts[name] <= SWINGS_ON:
         return ""
     what = f"the internal motion goes on after it, with {name} = {speeds[name][-1]:.3g} at t = {run.t[-1]:.4g} s"
-    do = "" if run.model.ideal else " method='relaxed' rests at both ends, as near to the program as that is."
+    do = "" if run.model.reduction.ideal else " method='relaxed' rests at both ends, as near to the program as that is."
     warn(f"The program is marginal, and {what}.{do}")
     return f"; {what}"
 

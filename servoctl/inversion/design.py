@@ -25,6 +25,7 @@ from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.markup import Shown
 from servoctl.methods.choice import Bounded
+from servoctl.model.equations import signal_groups
 from servoctl.model.model import Model
 from servoctl.progress import progress_bar
 from servoctl.run import Run
@@ -214,9 +215,9 @@ def _varied(model, vary):
 def _sized(model, of):
     """The signals whose actuation counts, with their sizes."""
     if of is None:
-        kinds = model.signal_groups
+        kinds = signal_groups(model.reduction)
         return {name: 1.0 for name, kind in kinds.items() if kind in ("actuation", "reaction")}
-    known = (*model.jet_names, *model.signal_groups)
+    known = (*model.jet_names, *signal_groups(model.reduction))
     if isinstance(of, Mapping):
         return numbers_by_name(of, known, "signal", "size", positive=True)
     return {named(name, known, "signal"): 1.0 for name in texts(of, "The signals")}
@@ -224,7 +225,7 @@ def _sized(model, of):
 
 def _limited(model, limits):
     """(low, high) by signal."""
-    known = (*model.jet_names, *model.signal_groups)
+    known = (*model.jet_names, *signal_groups(model.reduction))
     for name in mapping(limits, "The limits"):
         named(name, known, "signal")
     return {name: interval(name, value, "limit") for name, value in (limits or {}).items()}

@@ -14,7 +14,7 @@ from servoctl.checks import finite, interval, named, require_kind
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.inversion.zeros import NO_COEFFICIENT, ZeroPolynomial
 from servoctl.methods.kinks import SMOOTHER, kink
-from servoctl.model.model import Model
+from servoctl.model.model import Model, default_start
 from servoctl.model.start import State
 from servoctl.tolerances import ENTRY, TINY
 from servoctl.values import frozen
@@ -233,7 +233,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     ends = [finite(parameter, end, "range") for end in interval(parameter, values, "range")]
     _require_program(model)
     _require_part(model, parameter)
-    at = model.default_start() if at is None else require_kind(State, "at", at, "model.start(...)")
+    at = default_start(model) if at is None else require_kind(State, "at", at, "model.start(...)")
     polynomial, grid = ZeroPolynomial(model, parameter, at), np.linspace(*ends, VALUES)
     _require_linearisation(model, at)
     polynomial.follow(grid)
@@ -247,9 +247,9 @@ def _states(count):
 
 
 def _require_program(model):
-    if model.ideal or not model.reduction.program.residuals:
+    if model.reduction.ideal or not model.reduction.program.residuals:
         raise SpecificationError(
-            "The program is realised by an ideal reaction." if model.ideal else "There is no program.",
+            "The program is realised by an ideal reaction." if model.reduction.ideal else "There is no program.",
             "Outputs are redefined where actuators realise a program.",
             do='Write sv.Program(..., by="actuators").',
             by=model.reduction.program.by,
@@ -258,16 +258,16 @@ def _require_program(model):
 
 def _require_part(model, parameter):
     """Refuse a parameter of nothing but coordinates that were left out."""
-    mechanism, names = model.reduction.mechanism, ", ".join(model.left_out)
+    mechanism, names = model.reduction.mechanism, ", ".join(model.reduction.left_out)
     symbol = dict(zip(mechanism.parameters.names, mechanism.parameters.symbols, strict=True))[parameter]
     rows = (*model.reduction.program.residuals.values(), *mechanism.constraints.values())
     if names and not ca.depends_on(ca.vertcat(mechanism.balance, ca.vec(mechanism.E), *rows), symbol):
         raise SpecificationError(
             f"The model was derived without {names}, and nothing that is left depends on {parameter}.",
             "Coordinates that nothing couples to the program are left out, and their stability is not judged.",
-            do=f"Write sv.derive(mechanism, program, keep={list(model.left_out)}).",
+            do=f"Write sv.derive(mechanism, program, keep={list(model.reduction.left_out)}).",
             parameter=parameter,
-            left_out=model.left_out,
+            left_out=model.reduction.left_out,
         )
 
 

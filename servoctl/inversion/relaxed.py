@@ -37,6 +37,7 @@ from servoctl.inversion.transfer import EXCEEDED, GUESS, Transfer, state_sizes
 from servoctl.methods.bounded import subdivided
 from servoctl.methods.motion import breakpoints
 from servoctl.model.start import State
+from servoctl.model.variants import derived_near
 from servoctl.plants.driven import at_once, driven
 from servoctl.plants.plant import Plant, part_of
 from servoctl.reduction.idle import names_of, needed
@@ -385,7 +386,7 @@ class Relaxation(Transfer):
         v = self._inputs_of(plan, t)
         jets = np.vstack([x, np.array(self.node.function("motion", self.node.acceleration).map(len(t))(t[None], x, v))])
         if not np.isfinite(model.function("ode").grid(t, x, model.parameters)).all():
-            model = model.near(t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
+            model = derived_near(model, t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
         run = Run(
             t,

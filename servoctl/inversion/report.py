@@ -11,7 +11,7 @@ from servoctl.errors import NotRealisable, SpecificationError
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
 from servoctl.markup import Detailed, fitted, listed
-from servoctl.model.model import SAMPLED, Model, derive
+from servoctl.model.model import SAMPLED, Model, derive, including
 from servoctl.model.start import State
 from servoctl.reduction.self_motion import SelfMotion, self_motion
 from servoctl.reduction.structure import Directions, Local, directions, margins
@@ -248,7 +248,7 @@ def report(
         _directions(model, ends),
         tuple(row.story for row in model.reduction.hidden),
         model.free,
-        None if model.ideal else self_motion(model.reduction),
+        None if model.reduction.ideal else self_motion(model.reduction),
         ranks,
         margin,
         {} if along is None else {name: _effort(along, name, limits.get(name)) for name in efforts(along)},
@@ -269,7 +269,7 @@ def _not_realisable(mechanism, program, error):
 def _model_and_motion(what, start):
     """A model and its motion: a run, a start, or None; others are refused."""
     if isinstance(what, Model) and isinstance(start, State):
-        whole = what.including(start.names)
+        whole = including(what, start.names)
         if whole.state_names == start.names:
             return whole, start
     elif start is None:
@@ -312,7 +312,7 @@ def _residuals(model, structure):
 
 def _directions(model, ends):
     """The directions where the motion begins."""
-    if model.ideal or not ends:
+    if model.reduction.ideal or not ends:
         return None
     t, x = ends[0]
     return directions(model.reduction, [t], x[:, None], model.parameters)[0]

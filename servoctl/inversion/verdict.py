@@ -13,8 +13,9 @@ from servoctl.growth import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.methods.choice import Bounded
 from servoctl.methods.kinks import SMOOTHER, kink, stays_on_kink
-from servoctl.model.model import Model
+from servoctl.model.model import Model, default_start
 from servoctl.model.start import State
+from servoctl.model.variants import strong_near
 from servoctl.reduction.structure import margins
 from servoctl.run import Run
 from servoctl.tolerances import NOISE
@@ -121,7 +122,7 @@ def chosen_by(model, found, weighted=False):
     if found.dynamics == HYPERBOLIC_ZEROS:
         return Bounded()
     relaxes = found.dynamics in (SINGULAR, GROWS) or weighted and found.dynamics == MARGINAL
-    return RELAXED if relaxes and not model.ideal else None
+    return RELAXED if relaxes and not model.reduction.ideal else None
 
 
 def _of_motion(model, motion):
@@ -149,7 +150,7 @@ def _of_motion(model, motion):
 def _lost_at_default_start(model, t):
     """As `_lost_rank`, of the start near the guess of `derive`: a motion from elsewhere may have its rest there."""
     try:
-        return _lost_rank(model, t, np.asarray(model.default_start(t).values, dtype=float))
+        return _lost_rank(model, t, np.asarray(default_start(model, t).values, dtype=float))
     except ServoError:
         return ""
 
@@ -164,7 +165,7 @@ def _starting(model, motion):
     if isinstance(motion, Run):
         known = np.flatnonzero(np.isfinite(motion.jets[:n_x]).all(axis=0))[[0, -1]]
         return [(float(motion.t[k]), motion.jets[:n_x, k]) for k in known]
-    start = model.default_start() if motion is None else motion
+    start = default_start(model) if motion is None else motion
     return [(start.t, np.asarray(start.values, dtype=float))]
 
 
@@ -180,7 +181,7 @@ def _derived_for(model, motion, t, x):
     """The model with the pivots that a run has at an instant, or a start needs."""
     if isinstance(motion, Run):
         return motion.variant(int(np.argmin(np.abs(motion.t - t)))) or model
-    return model.there(t, np.append(x, np.zeros(model.n)))
+    return strong_near(model, t, np.append(x, np.zeros(model.n)))
 
 
 def _lost_rank(model, t, x):

@@ -65,7 +65,7 @@ class ZeroPolynomial:
         rate = np.abs(self._rates(self.t, q, self._numbers(self.own))).max(initial=0.0)
         if max(away, moving) <= MOVED * size and rate <= MOVED:
             return
-        nearest = dict(zip(self.model.coordinate_names, q.tolist(), strict=True))
+        nearest = dict(zip(self.model.reduction.mechanism.q.names, q.tolist(), strict=True))
         listed = ", ".join(f"{name} = {x:.6g}" for name, x in nearest.items())
         raise InconsistentStart(
             f"At t = {self.t:g} s the program moves: its residuals change by {rate:.2g} per second."

@@ -10,6 +10,7 @@ from servoctl.jets.branches import Branches
 from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch, strong
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.watch import Watch
+from servoctl.model.pivots import pivot_sizes
 from servoctl.model.switching import switching
 
 STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
@@ -86,7 +87,7 @@ class _Algebraic(Stepping):
         if not 0 < len(nodes) < NODES or nodes[-1, 0] != cuts[-1]:
             return False
         outputs = nodes.T[1 + nq :]
-        if not strong(self._levels(outputs)[2], self.model.pivot_sizes):
+        if not strong(self._levels(outputs)[2], pivot_sizes(self.model)):
             return False
         z, solved = self.f.newton(times, nodes, self.p)
         if z.shape[1] < len(times):

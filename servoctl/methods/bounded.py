@@ -26,6 +26,8 @@ from servoctl.jets.branches import cse
 from servoctl.methods.accuracy import component_sizes, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
+from servoctl.model.equations import invariant_names
+from servoctl.model.jets import with_highest
 from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE, TINY
 from servoctl.values import frozen
@@ -121,7 +123,7 @@ def _to_event(problem, events, solution, times):
     model = problem.model
 
     def jets(t):
-        return model.with_highest(t, problem.at(t, *solution), problem.p)
+        return with_highest(model, t, problem.at(t, *solution), problem.p)
 
     t = events.instants(np.union1d(times, solution[0]))[1]
     found = events.first(model, t, jets(t), lambda s: jets(np.array([s]))[:, 0])
@@ -228,7 +230,7 @@ class FreeEntries:
     def __init__(self, model, t, guess):
         self.model, self.p = model, model.parameters
         self._equations = model.once("bounded", lambda: _equations(model))
-        self.n_x, self.m = len(model.state_names), len(model.invariant_names())
+        self.n_x, self.m = len(model.state_names), len(invariant_names(model))
         self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *model.knots)
         self.times = np.linspace(min(ends), max(ends), len(ends) + 9)  # at which is asked what rates depend on
         self._choose(np.array([t]), np.asarray(guess, dtype=float)[:, None], self.n_x - self.m)

@@ -41,7 +41,7 @@ class Poles:
     ----------
     values : float or dict of str to sequence of complex
         One time constant T [s], which puts all poles at -1/T; or ρ poles [1/s] by row name, with ρ from
-        `model.raised`. Rows without an entry keep D^ρ ψ = 0.
+        `model.reduction.raised`. Rows without an entry keep D^ρ ψ = 0.
 
     Raises
     ------
@@ -67,10 +67,10 @@ class Poles:
     def by_row(self, model):
         """The poles [1/s] of every row of a model: {row name: (ρ,) array}."""
         if isinstance(self.values, float):
-            return {row: np.full(count, -1.0 / self.values) for row, count in model.raised.items()}
-        values = by_name(self.values, model.raised, "row", "The poles")
-        poles = {row: np.atleast_1d(values.get(row, np.zeros(rho))) for row, rho in model.raised.items()}
-        for row, rho in model.raised.items():
+            return {row: np.full(count, -1.0 / self.values) for row, count in model.reduction.raised.items()}
+        values = by_name(self.values, model.reduction.raised, "row", "The poles")
+        poles = {row: np.atleast_1d(values.get(row, np.zeros(rho))) for row, rho in model.reduction.raised.items()}
+        for row, rho in model.reduction.raised.items():
             if len(poles[row]) != rho:
                 raise SpecificationError(
                     f"The row {row!r} has {len(poles[row])} poles.",
@@ -91,7 +91,7 @@ def _poles_by_row(values):
         raise SpecificationError(
             "The dict of poles names no row.",
             "Error dynamics belong to rows.",
-            do="Name a row of model.raised, or pass a time constant.",
+            do="Name a row of model.reduction.raised, or pass a time constant.",
             values=values,
         )
     return {row: _conjugate_poles(row, poles) for row, poles in mapping(values, "The poles").items()}

@@ -8,6 +8,7 @@ import numpy as np
 from servoctl.checks import as_list, finite, mapping, whole
 from servoctl.errors import SpecificationError
 from servoctl.methods.watch import BESIDE_ENDS
+from servoctl.model.jets import jet_names_to
 from servoctl.run import Run
 from servoctl.values import frozen
 
@@ -180,7 +181,7 @@ class Events:
         return {name: [one for one in before if one.name == name] for name in self.events}
 
     def _along(self, event, model, t, jets):
-        return event.along(Run(t, jets, model.names_to(len(jets)), model))
+        return event.along(Run(t, jets, jet_names_to(model, len(jets)), model))
 
     def _value(self, name, model, s, at):
         return float(self._along(self.events[name], model, np.array([s]), at(s)[:, None])[0])

@@ -9,16 +9,29 @@ there.
 
 import ctypes
 
+import casadi as ca
 import numpy as np
 
 from servoctl.codegen.matrices import of_any_size
 from servoctl.codegen.native import pointer
 from servoctl.methods.taylor import series_loop
+from servoctl.model.equations import invariant_names
 
 RTOL = 1e-7  # of the steps along which deviations are moved, and of the least size of a level of the state
 NEARBY = 1e-6  # of the size of a state: distance of the states from which deviations are taken
 LEFT_OUT = 1e-3  # of a propagator over a step: its last terms, which bound those that are left out
 MOST_ALONG = 2_000  # of a motion: more of them take longer than propagators by the linearisation
+
+
+def active_states(model):
+    """Which states (n_x,) the rates or the invariants depend on: errors in the others stay as they are."""
+
+    def build():
+        parts = (model.function(name).expression.jac_sparsity(0, 1) for name in ("ode", "invariants"))
+        rates, invariants = (np.array(ca.DM.ones(part)) for part in parts)
+        return np.concatenate([rates[: len(model.state_names)], invariants]).any(axis=0)
+
+    return model.once("active states", build)
 
 
 class Deviations:
@@ -31,9 +44,9 @@ class Deviations:
     """
 
     def __init__(self, model, last, cuts, x, size, instants=()):
-        f, active = series_loop(model, last), model.active_states
+        f, active = series_loop(model, last), active_states(model)
         self.x, self._native = np.array(x), f.native
-        free = len(x) - len(model.invariant_names())
+        free = len(x) - len(invariant_names(model))
         self.Q, self.Z = np.empty((free, len(x))), np.empty((free, len(x), padded(len(instants))))
         settings, self._defect = np.array([RTOL, RTOL * size.min(), NEARBY, LEFT_OUT]), np.empty(1)
         series = np.empty((free, 1 + f.n_x + f.n_y))

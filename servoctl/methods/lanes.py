@@ -17,6 +17,9 @@ from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.narrow import steep
 from servoctl.methods.taylor import FAR_OFF, series_loop
+from servoctl.model.equations import invariant_names
+from servoctl.model.model import knots_within
+from servoctl.model.pivots import pivot_sizes
 from servoctl.model.switching import switching
 
 MOST_IN_LANES = 10**6  # of a case
@@ -99,7 +102,7 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
     x0, p, atol = cases
     n, n_x = x0.shape
     p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects branches of paths
-    arrays = {"x0": x0, "p": p, "atol": atol, "pivots": model.pivot_sizes, "times": times}
+    arrays = {"x0": x0, "p": p, "atol": atol, "pivots": pivot_sizes(model), "times": times}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= _results(n, len(times), n_x)
     many = _Many(arrays, t0=span[0], t1=span[1], rtol=rtol, max_steps=MOST_IN_LANES, n_times=len(times), n_cases=n)
@@ -132,8 +135,8 @@ def plan_many(model, span, cases, times, threads=None, progress=None):
         return None, None, False
     x0, p = cases
     n, n_x = x0.shape
-    cuts = breakpoints(span, model.require_smooth((min(span), max(span))))
-    arrays = {"x0": x0, "p": p, "pivots": model.pivot_sizes, "times": times, "cuts": cuts}
+    cuts = breakpoints(span, knots_within(model, (min(span), max(span))))
+    arrays = {"x0": x0, "p": p, "pivots": pivot_sizes(model), "times": times, "cuts": cuts}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= _results(n, len(times), n_x)
     counts = {"max_steps": NODES, "n_times": len(times), "n_cuts": len(cuts), "n_cases": n}
@@ -187,7 +190,7 @@ def _plan_library(f, model):
 
 def _off_manifold(model):
     """The largest residual of the invariants, relative to its gradient times the state, as a function of (t, X, p)."""
-    f, m = model.function("invariants").expression, len(model.invariant_names())
+    f, m = model.function("invariants").expression, len(invariant_names(model))
     t, x, p = f.sx_in()
     y = f(t, x, p)
     sizes = ca.sqrt(ca.reshape(y[m:], m, -1) ** 2 @ (1 + ca.fabs(x)) ** 2)

@@ -12,8 +12,10 @@ import numpy as np
 
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.methods.sizes import motion_sizes
-from servoctl.model.model import STRONG
+from servoctl.model.equations import balances, gradient_jets, invariant_names, leading_names
+from servoctl.model.pivots import pivot_sizes, pivot_strength, pivots_at, row_pivots, usual_column_sizes
 from servoctl.model.report import explain
+from servoctl.model.variants import STRONG, derived_near, reordered_at, with_diagonal_pivots
 from servoctl.tolerances import ENTRY
 from servoctl.values import frozen
 
@@ -191,13 +193,13 @@ class Monitor:
     def __init__(self, model, t, x, before=None):
         self.model = model
         self.f, self.invariants = model.function("matrices"), model.function("invariants")
-        self.l_names, self.b_names = model.leading_names()
+        self.l_names, self.b_names = leading_names(model.reduction)
         self.reference, self.lift = None, 1.0
         self.earlier = () if before is None else (*(m for m in before.earlier if m is not model), before.model)
-        self.balances = list(model.balances())
-        self.stories = [model.row_stories(), {}]
+        self.balances = list(balances(model.reduction))
+        self.stories = [{row.name: row.story for row in model.reduction.rows}, {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
-        self.m, self.start = len(model.invariant_names()), (t, np.array(x))
+        self.m, self.start = len(invariant_names(model)), (t, np.array(x))
         if before is not None:
             self.columns = before.columns
             self._inherit(before)
@@ -218,7 +220,8 @@ class Monitor:
     def rows(self):
         """Sizes of the rows of L and Bᵀ, to which later ones are compared."""
         rows = [np.linalg.norm(m / c, axis=1) for m, c in zip(self.matrices, self.columns, strict=True)]
-        for row, i in self.model.balances().items():  # TᵀM grows at the zeros of a pivot; √M_ii is its size with others
+        # TᵀM grows at the zeros of a pivot; √M_ii is its size with others
+        for row, i in balances(self.model.reduction).items():
             rows[0][row] = self.columns[0][i]
         return rows
 
@@ -247,7 +250,7 @@ class Monitor:
         moves, result = metric > 0, []
         if moves.all():
             return [metric, metric]
-        for m, usual in zip(matrices, self.model.column_sizes, strict=True):
+        for m, usual in zip(matrices, usual_column_sizes(self.model), strict=True):
             scaled = np.abs(m) / np.where(moves, metric, 1.0)
             rows = scaled[:, moves].max(axis=1, initial=0.0)
             rows = np.where(rows > 0, rows, scaled.max(axis=1, initial=0.0))[:, None]
@@ -346,7 +349,7 @@ class Monitor:
         before = np.maximum(sizes[:, :-1].max(axis=1, initial=0.0), self.reference)
         largest = np.maximum(before, sizes[:, -1])
         weakest = np.minimum((pivots * np.sign(last)[:, None]).min(axis=1), np.abs(last) * largest)
-        usual = np.maximum(self.reference, self.model.pivot_sizes)
+        usual = np.maximum(self.reference, pivot_sizes(self.model))
         if not ((weakest > DEGRADED * largest).all() and (NEGLIGIBLE * largest <= usual).all()):
             return False
         earlier = pivots[:, -2] / before if pivots.shape[1] > 1 else last
@@ -356,7 +359,7 @@ class Monitor:
     def _pole(self, stretch):
         """Singular where a pivot grows without bound in one step, as that of a row divided by a speed that vanishes."""
         ends = np.abs(stretch.pivots[:, :, -1])
-        largest = np.maximum(self.reference, self.model.pivot_sizes)[:, None]
+        largest = np.maximum(self.reference, pivot_sizes(self.model))[:, None]
         before = np.maximum.accumulate(np.column_stack([largest, ends]), axis=1)[:, :-1]
         for k in np.flatnonzero(np.any(NEGLIGIBLE * ends > before, axis=0)):
             t, x = stretch.t[k + 1], stretch.x[:, k + 1]
@@ -393,7 +396,7 @@ class Monitor:
         if lingering is not None:
             return lingering
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
-        degraded = weakest[-1] < DEGRADED and (self.model.diagonal or self.pivots_only(weakest[-1], t, x))
+        degraded = weakest[-1] < DEGRADED and (self.model.equations.definite or self.pivots_only(weakest[-1], t, x))
         return _other_pivots(k + 1, t, x) if degraded else None
 
     def _touched(self, stretch, k, sizes, scale):
@@ -493,7 +496,7 @@ class Monitor:
 
     def _weakest(self, pivots):
         """The smallest pivot, each relative to its size where pivots were chosen."""
-        reference = self.model.pivot_sizes
+        reference = pivot_sizes(self.model)
         return float((np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0))
 
     def repivoted(self, t, x, top, same_rows=True):
@@ -507,14 +510,14 @@ class Monitor:
             return other, Monitor(other, t, x, self)
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
-            model = self.model.near(t, jets, sizes)
+            model = derived_near(self.model, t, jets, sizes)
             return model, Monitor(model, t, x, self)
         except ServoError:
             return None
 
     def _before(self, t, jets):
         """The strongest of the earlier variants of this motion; None if all have weak pivots at these jets."""
-        strengths = [(model.strength(t, jets), -i, model) for i, model in enumerate(self.earlier)]
+        strengths = [(pivot_strength(model, t, jets), -i, model) for i, model in enumerate(self.earlier)]
         strength, _, model = max(strengths, default=(0.0, 0, None))
         return model if strength > STRONG else None
 
@@ -523,14 +526,14 @@ class Monitor:
         known = self.model.reduction.cascade is None  # else matrices have no value where pivots of a block vanish
         if known and self.rank_measure(t, x) <= LOST:
             return None
-        return self.model.without_choice or self._reordered(t, jets)
+        return with_diagonal_pivots(self.model) or self._reordered(t, jets)
 
     def _reordered(self, t, jets):
         """The model with other pivots of the leading matrix, unless the rows divide by a pivot that is weak."""
-        count = len(self.model.row_pivots)
-        pivots = np.abs(self.model.pivots_at(t, jets)[:count])
-        sizes = self.model.pivot_sizes if self.reference is None else self.reference
-        return self.model.reordered(t, jets) if np.all(pivots > STRONG * sizes[:count]) else None
+        count = len(row_pivots(self.model))
+        pivots = np.abs(pivots_at(self.model, t, jets)[:count])
+        sizes = pivot_sizes(self.model) if self.reference is None else self.reference
+        return reordered_at(self.model, t, jets) if np.all(pivots > STRONG * sizes[:count]) else None
 
     def failed(self, t, x, why, told, row):
         """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.
@@ -558,7 +561,7 @@ class Monitor:
             lost += [name for name, a, b in zip(rows, norms, r, strict=True) if a <= VANISHING * b and name not in lost]
         state = dict(zip(self.model.state_names, zip(x, self.largest, strict=True), strict=True))
         for row in lost or dict.fromkeys([*self.l_names, *self.b_names]):
-            for name in self.model.gradient_jets(row):
+            for name in gradient_jets(self.model.reduction, row):
                 value, largest = state.get(name, (1.0, 1.0))
                 if abs(value) < VANISHING * max(largest, 1e-12) and name not in zero:
                     zero.append(name)

@@ -1,6 +1,7 @@
 """A motion ends where a row takes another order than the one that it was derived with."""
 
 from servoctl.errors import ServoError
+from servoctl.model.variants import derived_near
 from servoctl.reduction.orders import other_order
 
 
@@ -16,7 +17,7 @@ def end_at_other_orders(motion):
 def _other_order(model, name, t, jets):
     """The error of a row whose order changes at t and jets."""
     try:
-        free = model.near(t, jets[: len(model.jet_names)]).free
+        free = derived_near(model, t, jets[: len(model.jet_names)]).free
     except ServoError as error:
         free = error.details.get("free")
     return other_order(name, t, free, model.free)

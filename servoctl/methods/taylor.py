@@ -24,7 +24,8 @@ from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
 from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
-from servoctl.model.equations import monitored_rows
+from servoctl.model.equations import invariant_names, monitored_rows
+from servoctl.model.pivots import pivot_sizes
 from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate
 from servoctl.values import frozen
@@ -316,7 +317,7 @@ def series_loop(model, last):
             free = (int(i not in solved.get(k, ((), (), ()))[1]) for k in range(1, e.top) for i in range(q.n))
             sizes, others = sizes | {"free": tuple(free)}, {"settled": settled(e)}
         others |= {name: model.function(given).expression for name, given in (("rates", "ode"), ("invariants",) * 2)}
-        sizes |= {"invariants": len(model.invariant_names()), "rates": others["rates"].numel_out(0)}
+        sizes |= {"invariants": len(invariant_names(model)), "rates": others["rates"].numel_out(0)}
         f = taylor_coefficients(e, last)
         return compiled(f, f"taylor_{last}", ("taylor",), project=e.project(), others=others, sizes=sizes)
 
@@ -426,7 +427,7 @@ class TaylorSteps(Stepping):
             farthest, jets[-self.n :] = np.maximum(farthest, off.max(axis=1, initial=0.0)), top
         if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(farthest).all():
             return False
-        if (least < DEGRADED * np.maximum(most, model.pivot_sizes)).any() or not (residuals <= LEAVES).all():
+        if (least < DEGRADED * np.maximum(most, pivot_sizes(model))).any() or not (residuals <= LEAVES).all():
             return False
         self.motion.fill(model, t_eval, jets)
         self.motion.largest, self.motion.drifted = states, float(drifted[0])

@@ -6,6 +6,7 @@ import numpy as np
 
 from servoctl.errors import ServoError
 from servoctl.markup import digits
+from servoctl.model.jets import with_highest
 from servoctl.model.start import STILL, without_rounding
 from servoctl.run import AGREES
 
@@ -23,7 +24,7 @@ def first_transient(run, motion):
 def _sought(run, motion):
     """As `first_transient`."""
     model, start, moves = run.model, run.start, np.abs(run.jets[run.model.nq :, 0]).max() > STILL  # at rest is none
-    driven = model.reduction.mechanism.actuators and not model.ideal
+    driven = model.reduction.mechanism.actuators and not model.reduction.ideal
     if not (moves and driven and model.free and start and run.success and run.t[0] < run.t[-1]):
         return ""
     names, forces = run.signals("actuation")
@@ -61,7 +62,7 @@ def _attracted(run, fallen, motion):
     model, t0 = run.model, float(run.t[0])
     known = dict(zip(model.state_names, run.jets[:, 0].tolist(), strict=False))
     for length in (0.0, run.t[-1] - t0, fallen - t0):
-        guess = {name: value for name, value in known.items() if length or name in model.coordinate_names}
+        guess = {name: value for name, value in known.items() if length or name in model.reduction.mechanism.q.names}
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -76,13 +77,13 @@ def _call(state, model, later):
     """The call of a start by as few digits of its free values as serve; "" if a force is above its `later` peaks."""
     for most in (4, 8, 16):
         held = {name: float(f"{state[name]:.{most}g}") for name in state.free}
-        guess = {name: float(f"{state[name]:.4g}") for name in model.coordinate_names if name not in held}
+        guess = {name: float(f"{state[name]:.4g}") for name in model.reduction.mechanism.q.names if name not in held}
         try:
             x = model.start(state.t, guess=guess, **held).values[:, None]
         except ServoError:
             continue
         f = model.signals("actuation")[1]
-        forces = f.grid([state.t], model.with_highest([state.t], x)[: f.n_x], model.parameters)[:, 0]
+        forces = f.grid([state.t], with_highest(model, [state.t], x)[: f.n_x], model.parameters)[:, 0]
         if (np.abs(forces) <= later).all():
             values = [f"t={state.t:g}"] * bool(state.t) + [f"{name}={value}" for name, value in held.items()]
             return f"model.start({', '.join([*values, *[f'guess={guess}'] * bool(guess)])})"

@@ -14,6 +14,7 @@ from servoctl.codegen.function import compiled
 from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges, size_of_terms
 from servoctl.methods.sizes import state_levels
+from servoctl.model.equations import invariant_names
 from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
@@ -231,7 +232,7 @@ class Residuals:
 
     def __init__(self, model, tolerance, coefficients=()):
         self.model, self.tolerance, self.f = model, tolerance, model.function("invariants")
-        self.names = [name for _, name in model.invariant_names()]
+        self.names = [name for _, name in invariant_names(model)]
         self.m, self.coarse = len(self.names), np.zeros(len(self.names))
         self.terms, self.first, self.led_back = np.zeros(self.m), None, len(coefficients) > 0
         places = {name: i for i, name in enumerate(self.names)}

@@ -460,6 +460,41 @@ def residual_rows(reduction):
     return {**reduction.original, **hidden}
 
 
+def residual_names(reduction):
+    """Names of the rows whose residuals a run reports."""
+    return (*residual_rows(reduction), *reduction.mechanism.reported, *reduction.mechanism.q.invariants)
+
+
+def signal_groups(reduction):
+    """The group of each signal that is no jet, {signal name: key of `SIGNALS`}."""
+    mechanism, program = reduction.mechanism, reduction.program
+    names = mechanism.q.force_names
+    groups = dict.fromkeys(mechanism.outputs, "outputs") | dict.fromkeys(mechanism.inputs, "given_inputs")
+    groups |= {"energy": "energy"}
+    if program.by == "actuators":
+        groups = dict.fromkeys(mechanism.actuators, "actuation") | groups
+    else:
+        groups |= dict.fromkeys((f"reaction_{name}" for name in names), "reaction")
+        groups |= dict.fromkeys((f"multiplier_{name}" for name in program.residuals), "multipliers")
+    groups |= dict.fromkeys((f"multiplier_{name}" for name in mechanism.constraints), "multipliers")
+    if not mechanism.q.plain:
+        rates = (f"{d}{name}" for d in ("d", "d2") for name in mechanism.q.names)
+        groups |= dict.fromkeys(rates, "coordinate_rates")
+    return groups
+
+
+def invariant_names(model):
+    """(level, name) of each invariant of the state, in the order of the function "invariants"."""
+    return model.once("invariant names", lambda: [(level, name) for level, name, _ in model.equations.invariant_rows])
+
+
+def balances(reduction):
+    """The coordinate or quasi-velocity, by index, of each row of L that is a row TᵀM of (3.18), by index."""
+    names = [f"balance of {name}" for name in reduction.mechanism.q.force_names]
+    rows = enumerate(monitored_rows(reduction))
+    return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.story}
+
+
 def monitored_rows(reduction):
     """Rows of L; with pivots of definite matrices the constraints alone, whose rank is that of all."""
     rows = reduction.rows

@@ -8,6 +8,7 @@ import numpy as np
 from servoctl.checks import distinct
 from servoctl.errors import ServoError, SingularProgram
 from servoctl.markup import fitted, listed
+from servoctl.model.equations import gradient_jets
 from servoctl.model.rest import first_motion, standstill_near
 from servoctl.reduction.rows import alternatives
 from servoctl.reduction.self_motion import self_motion
@@ -44,7 +45,7 @@ def _longer(model, r, room):
 
 def _left_out(model, r, room):
     """How many coordinates play no part in the program."""
-    names = model.left_out
+    names = model.reduction.left_out
     count = f"{len(names)} coordinates play" if len(names) > 1 else f"the coordinate {''.join(names)} plays"
     return f"{count} no part in the program: left out, unless keep= includes them" * bool(names)
 
@@ -146,7 +147,8 @@ def _lost_degrees(model, t, x, **facts):
     degrees = zip(usual.residuals, usual.relative_degree, there.relative_degree, strict=True)
     changed = ", ".join(f"that of {name} is {local}, in motion {r}" for name, r, local in degrees if local != r)
     zero, state = there.at[0][1].zero, dict(zip(model.state_names, x, strict=True))
-    decisive = zero or dict.fromkeys(jet for row in model.row_stories() for jet in model.gradient_jets(row))
+    r = model.reduction
+    decisive = zero or dict.fromkeys(jet for row in r.rows for jet in gradient_jets(r, row.name))
     values = [f"{name} = {state[name]:.4g}" for name in decisive if name in state]
     where = f", where {' and '.join(values)}" if values else ""
     lost = f"relative degrees differ there ({changed})" if changed else "zeros at infinity differ there"

@@ -12,7 +12,9 @@ import numpy as np
 from servoctl.checks import mapping
 from servoctl.errors import InconsistentStart, ServoError, SingularProgram
 from servoctl.jets.branches import shown
+from servoctl.model.equations import gradient_jets, invariant_names
 from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
+from servoctl.model.variants import derived_near
 from servoctl.progress import stage
 from servoctl.reduction.ranks import equilibrate
 from servoctl.tolerances import RESOLVED
@@ -147,7 +149,7 @@ def _faint(model, t, x):
     if (_divisors(model, model, t, x)[1] > FAINT).all():
         return False
     with suppress(ServoError):
-        near = model.near(t, np.append(x, np.zeros(model.n)))
+        near = derived_near(model, t, np.append(x, np.zeros(model.n)))
         return not (_divisors(model, near, t, x)[1] > FAINT).all()
     return True
 
@@ -173,7 +175,7 @@ def _determined(model, t, x):
     if not np.all(np.isfinite(jacobian)):
         return False
     sizes = np.linalg.svd(equilibrate(jacobian)[0].astype(float), compute_uv=False)
-    return np.sum(sizes > SPANNED) >= len(model.invariant_names())
+    return np.sum(sizes > SPANNED) >= len(invariant_names(model))
 
 
 def _at_rest(model, t, chosen):
@@ -193,7 +195,7 @@ def standstill(model, t, chosen):
         return None
     slow = STANDS * (1.0 + np.abs(x[: q.nq]).max())
     x[q.nq :][np.abs(x[q.nq :]) <= slow] = 0.0  # by rounding they would determine directions
-    directions = {row.name: model.gradient_jets(row.name) for row in rows if row.order > 0}
+    directions = {row.name: gradient_jets(model.reduction, row.name) for row in rows if row.order > 0}
     directions = {row: [name for name in names if name in q.names] for row, names in directions.items()}
     free = free_names(equations, x, aim, {name for names in directions.values() for name in names})
     open_ = {row: [name for name in names if name in free] for row, names in directions.items()}

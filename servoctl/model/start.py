@@ -10,8 +10,10 @@ import numpy as np
 from servoctl.checks import column, finite, mapping, named
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.markup import Shown
-from servoctl.model.equations import Invariants
+from servoctl.model.equations import Invariants, invariant_names
+from servoctl.model.jets import jet_names_to
 from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
+from servoctl.model.variants import derived_near, reordered_at, strong_near
 from servoctl.spec.mechanism import require_known
 from servoctl.values import Value, frozen
 
@@ -117,12 +119,12 @@ class JetEquations:
         q = r.mechanism.q
         top = max([r.top, *(q.order(e) + 1 for e in conditions.values())])
         if top == r.top and rows is None:
-            self.f, names = model.function("invariants"), [name for _, name in model.invariant_names()]
+            self.f, names = model.function("invariants"), [name for _, name in invariant_names(model)]
         else:
             extended = Invariants(r.mechanism, rows or r.rows, top, r.points)
             self.f, names = _numeric(extended.invariants()), [name for _, name, _ in extended.invariant_rows]
         self.invariants, self.rows, self.conditions, self.kept = len(names), [*names, *conditions], None, slice(None)
-        self.names = model.names_to(q.nq + (top - 1) * q.n)
+        self.names = jet_names_to(model, q.nq + (top - 1) * q.n)
         if conditions:
             jets, values = ca.vertcat(*(q.jet(k) for k in range(top))), ca.vertcat(*conditions.values())
             outputs = ca.densify(ca.vertcat(values, ca.vec(ca.jacobian(values, jets))))
@@ -229,11 +231,11 @@ def _notes(model, t, given, guess, state):
     if name is not None and far > DISTINCT * (1.0 + abs(guess[name])):
         shown = without_rounding(np.array([guess[name], state[name]]))[1]
         yield f"the nearest state found is {far:.4g} off the guess: {name} = {shown:.4g}, guessed {guess[name]:.4g}"
-    coordinates = {name: value for name, value in given.items() if name in model.coordinate_names}
+    coordinates = {name: value for name, value in given.items() if name in model.reduction.mechanism.q.names}
     turned = {name: value for name, value in coordinates.items() if abs(value) > 2 * np.pi and value % 5 == 0}
     angles = _all_rests(model).angles(t, model.parameters, np.zeros(model.nq)) if turned else ()
     for name, value in turned.items():
-        if angles[model.coordinate_names.index(name)]:
+        if angles[model.reduction.mechanism.q.names.index(name)]:
             yield f"{name} = {value:g} is in radians; {value:g} degrees are {np.radians(value):.4g}"
 
 
@@ -253,7 +255,7 @@ def _rests(model, equations, aim, held, conditions):
     states = [np.concatenate([z[: q.nq], np.zeros(len(aim.names) - q.nq)]) for z in found]
     jets = np.append(states[0][: len(model.state_names)], np.zeros(model.n)) if states else None
     if states and not _largest(equations, states[0]) < TOLERANCE:
-        equations = JetEquations(model.there(t, jets), t, conditions)
+        equations = JetEquations(strong_near(model, t, jets), t, conditions)
     states = [x for x in states if _largest(equations, x) < TOLERANCE and _stays(model, t, x)]
     others = [x for x in states[1:] if not _clear_choice(states[0], x, aim, model)]
     return (equations, np.array([states[0], *others])) if states else None
@@ -323,14 +325,14 @@ def _solve(model, equations, aim, conditions):
     blocks = model.reduction.cascade is not None
     if not residual < TOLERANCE and blocks:
         x, residual = _by_blocks(model, t, equations, aim)
-    choices = [(aim.reference, model.reordered)] * blocks + [(aim.reference, model.near), (None, model.near)]
+    choices = [(aim.reference, reordered_at)] * blocks + [(aim.reference, derived_near), (None, derived_near)]
     for at, choose in choices:
         if residual < TOLERANCE:
             break
         if at is None and not finite_there:
             x, residual = _best(equations, aim)
         try:  # a pivot of the model may vanish there
-            near = choose(t, np.append((x if at is None else at)[:n_x], np.zeros(model.n)))
+            near = choose(model, t, np.append((x if at is None else at)[:n_x], np.zeros(model.n)))
         except ServoError:
             continue
         if near is None:

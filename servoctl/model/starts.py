@@ -7,6 +7,7 @@ remain, which are affine in them. Then one state has the held values, and it is 
 import casadi as ca
 import numpy as np
 
+from servoctl.model.equations import invariant_names
 from servoctl.reduction.manifold import WELL_CONDITIONED
 
 PASSES = 2  # Newton steps of each level: one solves it, another one takes what rounding left
@@ -21,7 +22,7 @@ def linear_levels(model, held):
     names = model.state_names
     if not set(held) <= set(names) or len(set(held)) != model.free or model.reduction.cascade is not None:
         return None
-    f, m = model.function("invariants").expression, len(model.invariant_names())
+    f, m = model.function("invariants").expression, len(invariant_names(model))
     t, x, p = f.sx_in()
     values, entries = f(t, x, p)[:m], x.elements()
     of = [0 if i < model.nq else 1 + (i - model.nq) // model.n for i in range(len(names))]
@@ -39,7 +40,7 @@ def linear_levels(model, held):
 
 def same_start(model, held, parameters):
     """Whether starts with one set of held values are the same for all values of some parameters, by their names."""
-    f, m = model.function("invariants").expression, len(model.invariant_names())
+    f, m = model.function("invariants").expression, len(invariant_names(model))
     t, x, p = f.sx_in()
     places = [i for i, name in enumerate(model.numbers) if name in parameters]
     return set(held) <= set(model.state_names) and not (places and ca.depends_on(f(t, x, p)[:m], p[places]))
@@ -57,7 +58,7 @@ def linear_starts(model, t, held, p):
         return states, solved
     for name, values in held.items():
         states[:, model.state_names.index(name)] = values
-    f, m = model.function("invariants"), len(model.invariant_names())
+    f, m = model.function("invariants"), len(invariant_names(model))
     solved[:] = True
     with np.errstate(all="ignore"):
         for rows, unknown in (level for level in levels for _ in range(PASSES)):

@@ -8,6 +8,7 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import Branches, cse, has_switches
+from servoctl.model.equations import residual_names
 from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters
@@ -116,7 +117,7 @@ class Switching:
     def _require_same(self, model, branches):
         """Refuse a model of another state, or with other rows, than the one that was specified."""
         r, s = self.model.reduction, model.reduction
-        if (r.top, r.free, list(self.model.residual_names)) == (s.top, s.free, list(model.residual_names)):
+        if (r.top, r.free, residual_names(r)) == (s.top, s.free, residual_names(s)):
             return
         changed = [a.name for a, b in zip(r.rows, s.rows, strict=False) if (a.name, a.order) != (b.name, b.order)]
         raise SpecificationError(

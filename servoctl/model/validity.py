@@ -12,6 +12,7 @@ import numpy as np
 
 from servoctl.codegen.function import GRID_POINTS, compiled
 from servoctl.jets.branches import sizes_of_terms
+from servoctl.model.equations import invariant_names
 from servoctl.reduction.appell import NEGATIVE
 from servoctl.reduction.manifold import ON_MANIFOLD, at_usual_size, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
@@ -84,7 +85,7 @@ def affirmed_each(model, values):
         return result
     with np.errstate(all="ignore"):
         # from the manifold of the model's own parameters others are fewer steps away
-        at = model.rank_points if len(result) > 1 else _points_of(model)
+        at = model._rank_points if len(result) > 1 else _points_of(model)
         if len(result) > 1:
             result = _plainly_valid(model, at, values)
         others = np.flatnonzero(~result)
@@ -185,7 +186,7 @@ def _on_manifold(model, t, x, p):
 
 def _manifold(model, t, x, p):
     """Expressions of the state after a step of `least_steps` to the manifold, and whether it is there before."""
-    m, sizes = len(model.invariant_names()), _sizes_of(model)
+    m, sizes = len(invariant_names(model)), _sizes_of(model)
     y = model.function("invariants").expression(t, x, p)
     residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, -1))
     scales = ca.sqrt(jacobian**2 @ (sizes + ca.fabs(x)) ** 2)
@@ -256,7 +257,7 @@ def _moved(model, at, values):
     invariants, rates = model.function("invariants"), model.function("ode")
     t = np.tile(points.t.astype(float), cases)
     x = np.tile(at, cases)
-    p, m = np.repeat(values, n_points, axis=1), len(model.invariant_names())
+    p, m = np.repeat(values, n_points, axis=1), len(invariant_names(model))
     left, moved = np.arange(cases), np.zeros(cases, bool)
     for _ in range(MOVES):
         here = (left[:, None] * n_points + np.arange(n_points)).ravel()

@@ -90,6 +90,21 @@ class Reduction(Packed):
         """The rows that are hidden constraints."""
         return tuple(row for row in self.rows if row.story)
 
+    @property
+    def raised(self):
+        """How often each row is differentiated to the common order s̄, {row name: ρ}: the number of its poles."""
+        return {row.name: self.top - row.order for row in self.rows}
+
+    @property
+    def ideal(self):
+        """Whether an ideal reaction realises the program, instead of the actuators."""
+        return self.program.by == "ideal"
+
+    @property
+    def left_out(self):
+        """Names of the mechanism's coordinates that play no part in the program."""
+        return self.mechanism.left_out.get("coordinate", ())
+
     @cached_property
     def orders(self):
         """What the orders of the rows rest on."""

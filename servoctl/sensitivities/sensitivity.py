@@ -12,6 +12,7 @@ from servoctl.markup import Shown
 from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
+from servoctl.model.equations import invariant_names, signal_groups
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
@@ -179,10 +180,10 @@ def sensitivity(run: Run, of: str | Sequence[str] | None = None, to: str | Seque
     """
     model = require_run(run, "sensitivity")
     _require_smooth(model)
-    default = [name for name, kind in model.signal_groups.items() if kind in ("actuation", "reaction")]
+    default = [name for name, kind in signal_groups(model.reduction).items() if kind in ("actuation", "reaction")]
     of = tuple(dict.fromkeys(default if of is None else texts(of, "The names of signals")))
     to = tuple(dict.fromkeys(list(model.numbers) if to is None else texts(to, "The names of parameters")))
-    known = (*model.jet_names, *model.signal_groups)
+    known = (*model.jet_names, *signal_groups(model.reduction))
     if not of or not to:
         raise SpecificationError(
             f"The derivatives are of {len(of)} signals by {len(to)} numbers.",
@@ -198,7 +199,7 @@ def sensitivity(run: Run, of: str | Sequence[str] | None = None, to: str | Seque
         if name not in model.state_names:
             raise unknown(name, (*model.numbers, *model.state_names), "parameter or initial value")
     names = tuple(name for name in to if name in model.numbers)
-    kinds = tuple(dict.fromkeys(model.signal_groups[name] for name in of if name not in model.jet_names))
+    kinds = tuple(dict.fromkeys(signal_groups(model.reduction)[name] for name in of if name not in model.jet_names))
     S, independent = _of_state(model, run, names, initial)
     rows = dict(zip(_rows(model, kinds), _tangents(run, S, names, initial, kinds), strict=True))
     columns = (*names, *initial)
@@ -253,7 +254,7 @@ def _tangent_at_start(run, names, initial):
     """The tangent (n_x, K) of the first state, and the names of the initial values that do not depend on others."""
     model = run.variant(0)
     t, x = start_of(run)
-    m, n_x = len(model.invariant_names()), len(x)
+    m, n_x = len(invariant_names(model)), len(x)
     y = invariants_by(model, names)(t, x, model.parameters)
     G = y[m:].reshape(n_x + len(names), m).T
     G, by_parameters = G[:, :n_x], G[:, n_x:]

@@ -57,8 +57,8 @@ def closed_loop(args, model, plan, report):
     if args.no_loop:
         return None, True
     requested = bool(used(args, GIVEN))
-    if model.ideal or not plan.success:
-        why = "a law commands actuators, not an ideal reaction" if model.ideal else "the motion ended early"
+    if model.reduction.ideal or not plan.success:
+        why = "a law commands actuators, not an ideal reaction" if model.reduction.ideal else "the motion ended early"
         report.say(f"Closed loop: left out, as {why}.")
         return None, not requested
     try:

@@ -6,6 +6,7 @@ from pathlib import Path
 import servoctl as sv
 from servoctl.errors import NotRealisable, ServoError
 from servoctl.gallery import gallery
+from servoctl.model.model import including
 from servoctl.shell.options import VERBOSE
 from servoctl.shell.printing import Report
 from servoctl.shell.scenes import find_scene
@@ -27,7 +28,7 @@ def _report(args):
     mechanism, program = scene.build()
     report.say(mechanism)
     try:
-        model = sv.derive(mechanism, program).including([*scene.start, *scene.guess])
+        model = including(sv.derive(mechanism, program), [*scene.start, *scene.guess])
     except NotRealisable:
         report.say(sv.report(mechanism, program))
         return 0

@@ -16,6 +16,7 @@ from servoctl.figures.style import write_png
 from servoctl.inversion.verdict import GROWS, MARGINAL, chosen_by, verdict, verdict_with
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import ORDERS, Bounded, as_drift, as_method, default_method
+from servoctl.model.jets import with_highest
 from servoctl.progress import stage
 from servoctl.shell import loop
 from servoctl.shell.folder import ANIMATION, FIGURES, folder_of, jsonable, summary
@@ -138,14 +139,14 @@ def _planned(args, motion, report):
             return motion, *_simulate(motion, options)
     try:
         after = verdict_with(model, found, forward[0]) if found and forward else found
-        if method or after and after.dynamics == GROWS and not model.ideal:
+        if method or after and after.dynamics == GROWS and not model.reduction.ideal:
             from servoctl.inversion.choice import Request  # its import takes as long as a short motion
 
             request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
             run = request.relaxed(after, start, moving=not method and found.dynamics != MARGINAL)
             if args.samples:
                 run = resampled(run, options["t_eval"])
-                run = replace(run, jets=run.model.with_highest(run.t, run.jets[: len(run.model.state_names)]))
+                run = replace(run, jets=with_highest(run.model, run.t, run.jets[: len(run.model.state_names)]))
             return motion, run, ""
     except ServoError as error:
         report.say(f"There is no relaxed motion: {error}")

@@ -9,6 +9,7 @@ from pathlib import Path
 import servoctl as sv
 from servoctl.checks import is_number
 from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.model.model import including
 
 _MODULE = "servoctl_scene"  # name of the module made from a user's file, so that it shadows no other module
 
@@ -36,7 +37,7 @@ def find_scene(given):
 
 def model_of(scene, named=()):
     """The model of a scene, with the coordinates that its start and these names of signals name."""
-    return sv.derive(*scene.build()).including([*scene.start, *scene.guess, *named])
+    return including(sv.derive(*scene.build()), [*scene.start, *scene.guess, *named])
 
 
 def _module(path):

@@ -10,6 +10,8 @@ from servoctl.errors import LimitExceeded, NameUnknown, ServoError, Specificatio
 from servoctl.methods.accuracy import component_sizes, relative_error
 from servoctl.methods.choice import Adaptive, Algebraic, Project, Taylor
 from servoctl.methods.sizes import state_levels
+from servoctl.model.equations import signal_groups
+from servoctl.model.model import knots_within
 from servoctl.simulation import consistent_state, simulated
 from servoctl.study.executor import whole_run
 from servoctl.verification import verify
@@ -29,14 +31,14 @@ class Converged:
         consistent_state(model, start, span[0])
         self.model, self.start, self.span, self._runs = model, start, span, {}
         t0, t1 = span
-        self.knots = [k for k in model.require_smooth((min(span), max(span))) if min(span) < k < max(span)]
+        self.knots = [k for k in knots_within(model, (min(span), max(span))) if min(span) < k < max(span)]
         self.few = np.union1d(np.linspace(t0, t1, INSTANTS), self.knots)
         between = t0 + (t1 - t0) * (np.arange(COMPARED) + BETWEEN) / COMPARED
         self.times = np.unique([t0, *between, t1, *self.knots])
         self.method, self.drift, checks = Taylor(16, rtol=1e-15, atol=1e-15), Project(), CHECKS
         if model.flat:
             self.method, self.drift, checks = Algebraic(), None, CHECKS[::-1]
-        self.forces = [name for name, of in model.signal_groups.items() if of in ("actuation", "reaction")]
+        self.forces = [name for name, of in signal_groups(model.reduction).items() if of in ("actuation", "reaction")]
         self.at(self.times)
         self.checked_by, self.check = self._verified(checks, seconds)
 

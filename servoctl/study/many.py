@@ -14,7 +14,7 @@ from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
-from servoctl.model.model import Model
+from servoctl.model.model import Model, including, knots_within
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
@@ -84,7 +84,7 @@ def simulate_many(
     ServoError
         If the workers of the executor died before they finished a case.
     """
-    model = require_kind(Model, "model", model, "sv.derive(...)").including(names_of(starts))
+    model = including(require_kind(Model, "model", model, "sv.derive(...)"), names_of(starts))
     span = as_span(t_span)
     if executor is not None and not isinstance(executor, Executor):
         executor = whole("executor", executor, least=1)
@@ -235,7 +235,7 @@ class _Many:
     def _prepared(self, span):
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
         t, span = span[0], (min(span), max(span))
-        knots = self.model.require_smooth(span)
+        knots = knots_within(self.model, span)
         p, x = self.parameters, np.empty((self.n, len(self.model.state_names)))
         ready = self._affirmed(p)
         try:
@@ -245,7 +245,7 @@ class _Many:
         for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
                 model = self.model_of(i)
-                if model.reduction is self.model.reduction and model.require_smooth(span) == knots:
+                if model.reduction is self.model.reduction and knots_within(model, span) == knots:
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
         which = np.flatnonzero(ready)

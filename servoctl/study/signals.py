@@ -4,6 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from servoctl.model.equations import signal_groups
+from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.run import ByName, Run
 
 MOST_POINTS = 100_000  # of motions and instants at which signals are evaluated in one call
@@ -20,9 +22,9 @@ class Signals(ByName, Mapping):
     def __init__(self, model, t, count, states, parameters, level, runs):
         self._model, self._t, self._count, self._runs = model, t, count, runs
         self._states, self._parameters = states, parameters
-        self._jet_names = model.names_to(model.nq + level * model.n)
+        self._jet_names = jet_names_to(model, model.nq + level * model.n)
         self._values = dict(zip(model.state_names, states, strict=True))
-        self.names = tuple(dict.fromkeys([*self._jet_names, *model.signal_groups]))
+        self.names = tuple(dict.fromkeys([*self._jet_names, *signal_groups(model.reduction)]))
 
     def __getitem__(self, name):
         return self._along(name)[: self._count]
@@ -39,7 +41,7 @@ class Signals(ByName, Mapping):
     def _computed(self, name):
         """The signals (K, N) of a group by name, evaluated for all motions at once where their jets suffice."""
         model = self._model
-        top, kind = model.jet_names[len(model.state_names) :], model.signal_groups.get(name)
+        top, kind = model.jet_names[len(model.state_names) :], signal_groups(model.reduction).get(name)
         names, f = model.signals(kind) if kind else (top, None)
         at_once = name in top or f is not None and f.n_x <= len(model.jet_names)
         each = np.arange(self._states.shape[2])
@@ -59,7 +61,7 @@ class Signals(ByName, Mapping):
         """A function of the jets, or the highest of these, (n, K, N) for some motions."""
         count = len(part)
         t, p = np.repeat(self._t, count), np.tile(self._parameters[:, part], len(self._t))
-        jets = self._model.with_highest(t, self._states[:, :, part].reshape(len(self._states), -1), p)
+        jets = with_highest(self._model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
         y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
         return y.reshape(len(y), len(self._t), count)
 
@@ -70,7 +72,7 @@ class Signals(ByName, Mapping):
             return self._runs.get(i)
         values = dict(zip(self._model.numbers, self._parameters[:, i].tolist(), strict=True))
         model = self._model.with_parameters(**values)
-        jets = model.with_highest(self._t, states)
+        jets = with_highest(model, self._t, states)
         if len(self._jet_names) > len(jets):
-            jets = model.extended(self._t, jets, len(self._jet_names))
+            jets = extended(model, self._t, jets, len(self._jet_names))
         return Run(self._t, jets, self._jet_names, model)

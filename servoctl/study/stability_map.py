@@ -162,7 +162,7 @@ class StabilityMap(Shown):
         return draw_stability(self, method, poles, (*ORDERS, "Taylor"))
 
     def __repr__(self):
-        raised = ", ".join(f"{row} {count}x" for row, count in self.model.raised.items() if count)
+        raised = ", ".join(f"{row} {count}x" for row, count in self.model.reduction.raised.items() if count)
         raised = raised or "none: no row was differentiated"
         drifts = [None, 1.0, 0.1, 0.01]  # time constants of poles [s]
         lines = [

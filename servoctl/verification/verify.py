@@ -11,7 +11,9 @@ from servoctl.checks import whole
 from servoctl.control.result import Closed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.sizes import sizes_of
+from servoctl.model.jets import extended, jet_names_to
 from servoctl.model.switching import switching
+from servoctl.model.variants import derived_near, place_of, variant_at
 from servoctl.progress import stage
 from servoctl.run import SAME_TIME, Run, on_side, require_run, sides
 from servoctl.values import frozen
@@ -125,13 +127,15 @@ def _required(run):
     faulty = int(np.sum(~good[:count]) + np.sum((steps >= 0) if backwards else (steps <= 0)))
     parts = {"variants": _variants(model, run, count), "knots": tuple(knots)}
     parts["stored"] = {name: np.asarray(values)[:count] for name, values in run.stored.items() if np.ndim(values)}
-    return replace(run, t=t[:count], jets=jets[:, :count], jet_names=model.names_to(len(jets)), **parts), faulty
+    return replace(run, t=t[:count], jets=jets[:, :count], jet_names=jet_names_to(model, len(jets)), **parts), faulty
 
 
 def _variants(model, run, count):
     """Ranges of samples and their variants, of this model itself: a run says on which sides and near which places."""
     with contextlib.suppress(ServoError, LookupError, TypeError, ValueError):
-        made = [(a, min(b, count), on_side(model, sides(model, v)).at(v.place)) for a, b, v in run.variants]
+        made = [
+            (a, min(b, count), variant_at(on_side(model, sides(model, v)), place_of(v))) for a, b, v in run.variants
+        ]
         made = [variant for variant in made if variant[0] < count]
         if [0, *(end for _, end, _ in made)] == [*(first for first, *_ in made), count]:
             return tuple(made)
@@ -198,7 +202,7 @@ class _Checks:
 
     def _inputs(self):
         """The actuation, or the reaction of an ideal program, as the run gives it, by variant."""
-        names = self.model.signals("reaction" if self.model.ideal else "actuation")[0]
+        names = self.model.signals("reaction" if self.model.reduction.ideal else "actuation")[0]
         stored = ((name, numbers(self.stored.get(name, np.nan), 1)) for name in names)
         alike = {name: v for name, v in stored if v is not None and v.shape == self.run.t.shape}
         values = np.array([alike.get(name, self.fresh[name]) for name in names]).reshape(len(names), len(self.run.t))
@@ -281,7 +285,7 @@ class _Checks:
             for k in ks[:MOST_OWN_PIVOTS]:
                 with contextlib.suppress(ServoError):
                     at = self.run.jets[: len(self.model.jet_names), sample[k]]
-                    found.append((flow(self.model.near(self.run.t[sample[k]], at)), [k]))
+                    found.append((flow(derived_near(self.model, self.run.t[sample[k]], at)), [k]))
             return found
 
         sides = [own_sides] if self.flat and self.family else []
@@ -411,7 +415,7 @@ class _Checks:
         if len(self.run.jets) <= n_z:
             return {}
         for at in self.samples:
-            again = at.model.extended(at.t, at.z[:n_z], len(at.z))
+            again = extended(at.model, at.t, at.z[:n_z], len(at.z))
             worst = max(worst, largest((at.z - again) / self.sizes[:, None]))
         return {"higher jets": worst}
 
@@ -428,7 +432,7 @@ class _Checks:
 
     def outside(self):
         """Largest part of an ideal reaction outside the actuators' directions, relative to the reaction."""
-        if not (self.model.ideal and self.model.actuators):
+        if not (self.model.reduction.ideal and self.model.actuators):
             return {}
         n, worst, size = self.model.n, 0.0, 1e-300
         for at in self.samples:
