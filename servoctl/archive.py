@@ -10,7 +10,7 @@ from servoctl.checks import as_path
 from servoctl.errors import ServoError
 from servoctl.units import with_unit
 
-FORMAT, SUFFIX = 1, ".npz"
+FORMAT, SUFFIX = 1, ".npz"  # of files: others are refused
 MOST_LETTERS = 200  # of another package's message
 FORMULA = ("=", "+", "-", "@", "\t", "\n")  # how texts begin that spreadsheets evaluate
 

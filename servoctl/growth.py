@@ -19,7 +19,7 @@ from servoctl.checks import positive
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
 from servoctl.methods import flow
-from servoctl.methods.kinks import SMOOTHER, stays_on_kink
+from servoctl.methods.kinks import SMOOTHER, stays_on_switch
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.stability import stability_function
 from servoctl.model.equations import invariant_names
@@ -229,7 +229,7 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
     model = require_run(run, "internal_dynamics")
     if model.flat:
         return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
-    if switch := stays_on_kink(model, run):
+    if switch := stays_on_switch(model, run):
         cause = f"the run stays on a switch, {switch}, and has no linearisation; {SMOOTHER}"
         return replace(_inconclusive(model, run), cause=cause)
     resolved = _resolved(model, run)
@@ -266,7 +266,7 @@ def growth_bound(model, run):
 
 
 @np.errstate(all="ignore")
-def quiet_by_series(model, run, last):
+def no_growth_by_series(model, run, last):
     """Whether propagators by the series of a motion say that its internal dynamics are not unstable.
 
     They are those of `internal_dynamics`, without a Jacobian and without smaller and smaller steps; `last` is the
@@ -282,10 +282,10 @@ def quiet_by_series(model, run, last):
     if not reached or not moved.defect() <= DEFECT:
         return False
     quiet, _, _ = flow.growth(moved.Z, len(between), _SETTINGS)
-    return quiet or _quiet_by_steps(model, last, between, cuts, x[:, 0], size)
+    return quiet or _no_growth_by_steps(model, last, between, cuts, x[:, 0], size)
 
 
-def _quiet_by_steps(model, last, between, cuts, x, size):
+def _no_growth_by_steps(model, last, between, cuts, x, size):
     """The same by propagators over steps that end at all instants, whatever their sizes."""
     forward = np.sign(between[-1] - between[0])
     moved = flow.Deviations(model, last, forward * np.union1d(forward * between, forward * np.array(cuts)), x, size)

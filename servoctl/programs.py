@@ -1,12 +1,12 @@
 """Programs as people say them: residuals by name, in dicts that join with |, for `Program` and constraints.
 
-Each function takes the name that its residuals begin with. What is wished may be a number or an expression of time, of
+Each function takes the name that its residuals begin with. What is desired may be a number or an expression of time, of
 parameters, or of the coordinates::
 
     tool = robot.frame("tool")
     program = sv.Program(pose("tool", tool, path, turn) | {"elbow": robot.q["joint_3"] - 0.2})
 
-A norm is compared by the half difference of squares over the wished value, (|v|^2 - c^2)/(2 c), which is |v| - c to
+A norm is compared by the half difference of squares over the desired value, (|v|^2 - c^2)/(2 c), which is |v| - c to
 first order and has derivatives of every order.
 """
 
@@ -85,9 +85,9 @@ def pose(name, frame, position, rotation):
     frame : Frame, or pair of a position (3,) and a rotation (3, 3)
         The frame that moves.
     position : (3,) SX or sequence
-        Its wished origin [m].
+        Its desired origin [m].
     rotation : (3, 3) SX or array
-        Its wished rotation from its axes to the world's, as from `paths.turn` or `paths.slerp`.
+        Its desired rotation from its axes to the world's, as from `paths.turn` or `paths.slerp`.
 
     Returns
     -------
@@ -109,16 +109,16 @@ def orientation(name, frame, rotation):
     frame : Frame, or (3, 3) SX
         The frame that moves, or its rotation.
     rotation : (3, 3) SX or array
-        The wished rotation.
+        The desired rotation.
 
     Returns
     -------
     dict of str to SX
-        name_rx, name_ry, name_rz [rad], in the wished axes.
+        name_rx, name_ry, name_rz [rad], in the desired axes.
     """
     turn = frame.rotation if isinstance(frame, Frame) else frame
-    wished, turn = (rotations.as_rotation(value, f"a rotation of {name!r}") for value in (rotation, turn))
-    difference = rotations.vector(wished.T @ turn)
+    desired, turn = (rotations.as_rotation(value, f"a rotation of {name!r}") for value in (rotation, turn))
+    difference = rotations.vector(desired.T @ turn)
     return {f"{name}_r{axis}": difference[i] for i, axis in enumerate("xyz")}
 
 

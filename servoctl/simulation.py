@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, warn
-from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, quiet_by_series
+from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, no_growth_by_series
 from servoctl.methods.accuracy import (
     ATOL,
     absolute_tolerances,
@@ -39,7 +39,7 @@ from servoctl.methods.choice import (
 )
 from servoctl.methods.events import Event, Events, as_events, occurrences
 from servoctl.methods.motion import DEFAULT_SAMPLES, breakpoints, margin_at, without_interruption
-from servoctl.methods.orders import end_at_other_orders
+from servoctl.methods.orders import end_where_orders_change
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
@@ -239,7 +239,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
 
     def finished():
         motion.end_where_undefined(str(method))
-        end_at_other_orders(motion)
+        end_where_orders_change(motion)
         started = _as_started(model, start, t0, x0 if motion.start is None else motion.start)
         run = _run(model, motion, (method, drift, knots), started, t1)
         return _resample(run, times) if t_eval is not None and isinstance(method, RungeKutta) else run
@@ -321,7 +321,7 @@ def _quiet(run, by_series):
     """Whether the series, or the bound of the growth, tell that it deserves no warning; the quicker comes first."""
     ways = [lambda: growth_bound(run.model, run) <= UNSTABLE]
     if by_series is not None:
-        ways.insert(run.counters["steps"] > FEW_STEPS, lambda: quiet_by_series(run.model, run, by_series))
+        ways.insert(run.counters["steps"] > FEW_STEPS, lambda: no_growth_by_series(run.model, run, by_series))
     return any(way() for way in ways)
 
 

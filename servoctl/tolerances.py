@@ -1,6 +1,6 @@
 """Numbers that decide what is zero, used by several packages; other numbers are at the top of the files that use them.
 
-docs/numbers.md says what each decides, and what goes wrong if it is ten times larger or smaller.
+docs/numbers.md lists them with all others, and the tests that pin them.
 """
 
 import numpy as np

@@ -219,7 +219,7 @@ def test_rows_and_motions_are_those_of_one_expression_for_each_row(name, pairs):
     by_blocks, by_expressions = pairs(name)
     assert by_blocks.reduction.cascade is not None and by_expressions.reduction.cascade is None
     for row, other in zip(by_blocks.reduction.rows, by_expressions.reduction.rows, strict=True):
-        parts = "name", "kind", "order", "story", "affine", "uses"
+        parts = "name", "kind", "order", "derivation", "affine", "uses"
         assert [getattr(row, part) for part in parts] == [getattr(other, part) for part in parts]
     run, other = moved(by_blocks), moved(by_expressions)
     tolerance = 1e-13 if by_blocks.flat else 1e-9

@@ -578,7 +578,7 @@ def test_propagators_that_shrink_beyond_rounding_are_multiplied_one_by_one():
     _, _, R = along(model, 17, [0.0, 4.0], x, np.ones(4), ["x", "dx"]).by_step()
     assert np.linalg.norm(reduce(lambda P, R: R @ P, R)) < 1e-20
     run = sv.simulate(model, model.start(x=1.0, dx=0.0), (0.0, 4.0), "Taylor")
-    assert growth.quiet_by_series(model, run, 17)
+    assert growth.no_growth_by_series(model, run, 17)
 
 
 @pytest.mark.usefixtures("c_compiler")
@@ -598,7 +598,7 @@ def test_what_takes_less_time_tells_first_that_growth_is_harmless(gallery_model,
     """The bound is silent on 10 s of the wheel, the series on a run whose series are too coarse."""
     model, tried = gallery_model("appell-hamel").with_parameters(I_x=0.1126, I_y=0.225), []
     start = model.start(x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5)
-    for name in ("growth_bound", "quiet_by_series"):
+    for name in ("growth_bound", "no_growth_by_series"):
         real = getattr(simulation, name)
         monkeypatch.setattr(simulation, name, lambda *a, name=name, real=real: tried.append(name) or real(*a))
 
@@ -607,7 +607,7 @@ def test_what_takes_less_time_tells_first_that_growth_is_harmless(gallery_model,
         verdict = sv.simulate(model, start, (0.0, end), method).internal["verdict"]
         return verdict, tuple(tried)
 
-    bound, series = "growth_bound", "quiet_by_series"
+    bound, series = "growth_bound", "no_growth_by_series"
     assert judged_by(10.0, "Taylor") == ("neutral", (series,))
     assert judged_by(10.0, sv.methods.Taylor(2, rtol=1e-9)) == ("neutral", (bound, series))  # many steps
     assert judged_by(0.5, sv.methods.Taylor(2, rtol=1e-9)) == ("neutral", (bound,))
@@ -618,9 +618,9 @@ def test_deviations_that_shrink_stay_in_the_tangent_space(gallery_model, monkeyp
     """Errors of differences along the constraints do not shrink: one-sided differences leave the tangent space here."""
     model, scene = gallery_model("passive-arm"), gallery["passive-arm"]
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, "Taylor")
-    assert growth.quiet_by_series(model, run, last_index(model, sv.methods.Taylor()))
+    assert growth.no_growth_by_series(model, run, last_index(model, sv.methods.Taylor()))
     monkeypatch.setattr(flow, "of_any_size", lambda *_: None)  # as where this unit alone could not be compiled
-    assert growth.quiet_by_series(model, run, last_index(model, sv.methods.Taylor()))
+    assert growth.no_growth_by_series(model, run, last_index(model, sv.methods.Taylor()))
 
 
 @pytest.mark.parametrize("length", [9.0, 20.0])

@@ -74,7 +74,7 @@ def test_a_computed_motion_is_kept_when_interrupted_at_its_end(wheel_model, meth
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize("while_", ["growth_bound", "quiet_by_series", "internal_dynamics", "_interrupted motion"])
+@pytest.mark.parametrize("while_", ["growth_bound", "no_growth_by_series", "internal_dynamics", "_interrupted motion"])
 def test_a_motion_is_kept_when_its_growth_is_judged(wheel_model, while_, ctrl_c, monkeypatch):
     model, start = wheel_model
     compute, calls = simulation._motion, []
@@ -88,7 +88,7 @@ def test_a_motion_is_kept_when_its_growth_is_judged(wheel_model, while_, ctrl_c,
         motion.interrupted = len(calls) == 2
         return motion
 
-    monkeypatch.setattr(simulation, "quiet_by_series", lambda *_: False)
+    monkeypatch.setattr(simulation, "no_growth_by_series", lambda *_: False)
     if while_ == "_interrupted motion":
         monkeypatch.setattr(simulation, "_motion", interrupted)
     else:

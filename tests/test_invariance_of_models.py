@@ -97,8 +97,8 @@ def test_scaled_specifications_get_the_same_report():
     reports = []
     for options in ({}, {"unit": 1e3}, {"unit": 1e-3}, {"residuals": lambda q, X, Z: {"X": 1e6 * X, "Z": Z}}):
         r = derive(*crane(**options)).reduction
-        stories = [(row.name, row.order, row.story) for row in r.rows]
-        reports.append((stories, r.needs, r.top, r.realisation.dependent))
+        derivations = [(row.name, row.order, row.derivation) for row in r.rows]
+        reports.append((derivations, r.needs, r.top, r.realisation.dependent))
     assert all(report == reports[0] for report in reports)
 
 

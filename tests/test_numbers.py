@@ -1,8 +1,7 @@
-"""Numbers that decide: docs/numbers.md tells their values, and the most important ones are pinned from both sides."""
+"""Numbers that decide: docs/numbers.md has them all, and the most important ones are pinned from both sides."""
 
-import ast
-import importlib
 import re
+import runpy
 from pathlib import Path
 
 import casadi as ca
@@ -16,56 +15,28 @@ from servoctl.reduction.rows import dependence
 from servoctl.tolerances import EXTENDED
 
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "numbers.md").read_text(encoding="utf-8")
-TESTS = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+PAGE = runpy.run_path(str(ROOT / "docs" / "numbers.py"))
+CONSTANTS = {
+    (path.relative_to(ROOT / "servoctl").as_posix(), name): comment
+    for path in (ROOT / "servoctl").rglob("*.py")
+    for name, _, comment in PAGE["constants"](path)
+}
 
 
-def table():
-    """(module, name, value, test) of each row of the page."""
-    module = None
-    for line in PAGE.splitlines():
-        heading = re.match(r"#+ .*`servoctl/(.+)\.py`", line)
-        if heading:
-            module = "servoctl." + heading[1].replace("/", ".")
-        row = re.match(r"\| `(\w+)` \| ([^|]+) \|.*\| ([^|]+) \|$", line)
-        if row:
-            yield module, row[1], row[2].strip(), row[3].strip()
+def test_the_page_is_written_from_the_sources():
+    assert (ROOT / "docs" / "numbers.md").read_text(encoding="utf-8") == PAGE["page"](), "python docs/numbers.py"
 
 
-ROWS = list(table())
-MODULES = sorted({module for module, *_ in ROWS})
+def test_every_number_says_what_it_is():
+    assert [place for place, comment in CONSTANTS.items() if not comment and not place[0].startswith("gallery/")] == []
 
 
-def on_the_page(module, name, value):
-    """Whether a module's constant has the value that the page tells."""
-    first, _, without_extended = value.partition(" or ")
-    told = first if EXTENDED or not without_extended else without_extended
-    return np.array_equal(getattr(importlib.import_module(module), name), ast.literal_eval(told))
-
-
-def test_the_page_has_the_values_in_the_code():
-    assert [(module, name, value) for module, name, value, _ in ROWS if not on_the_page(module, name, value)] == []
-
-
-def test_the_tests_that_the_page_names_exist():
-    for _, name, _, told in ROWS:
-        tests = re.findall(r"`(test_\w+)`", told)
-        assert tests or told in ("no test pins it", "not tried"), name
-        assert all(f"def {one}(" in TESTS for one in tests), f"the page names a test of {name} that does not exist"
-
-
-def numbers_of(module):
-    """Names of a module's own constants that are numbers."""
-    tree = ast.parse((ROOT / (module.replace(".", "/") + ".py")).read_text(encoding="utf-8"))
-    constants = importlib.import_module(module)
-    targets = [target for node in tree.body if isinstance(node, ast.Assign) for target in node.targets]
-    names = [name.id for target in targets for name in (target.elts if isinstance(target, ast.Tuple) else [target])]
-    return {name for name in names if type(getattr(constants, name)) in (int, float)}
-
-
-def test_every_number_of_a_module_is_on_the_page():
-    told = {module: {name for home, name, *_ in ROWS if home == module} for module in MODULES}
-    assert {module: missing for module in MODULES if (missing := numbers_of(module) - told[module])} == {}
+def test_what_pins_a_number_exists():
+    tests = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    for place, told in PAGE["pinned"]().items():
+        names = re.findall(r"test_\w+", told)
+        assert place in CONSTANTS, place
+        assert told == "none" or names and all(f"def {name}(" in tests for name in names), place
 
 
 # pinned from both sides: each of these fails where its number is ten times larger, and where it is ten times smaller --

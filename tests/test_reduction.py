@@ -766,8 +766,8 @@ def test_a_hidden_row_replaces_one_of_the_dynamics_and_not_the_residual(names):
     mechanism = sv.Mechanism(q, gibbs=gibbs, potential=3.0 * (a - b) ** 2 / 2, actuators={"f": a})
     r = derive(mechanism, sv.Program({"B": acceleration["b"] + ca.sin(q.t)})).reduction
     written, hidden = r.rows
-    assert (written.name, written.order, written.story) == ("B", 2, "")
-    assert (hidden.kind, hidden.order) == ("dynamics", 0) and "B" in hidden.story
+    assert (written.name, written.order, written.derivation) == ("B", 2, "")
+    assert (hidden.kind, hidden.order) == ("dynamics", 0) and "B" in hidden.derivation
     assert r.free == 2
 
 

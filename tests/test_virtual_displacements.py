@@ -112,4 +112,4 @@ def test_hidden_rows_say_what_was_combined_and_lower_the_orders(name, gallery_mo
     of_balances = max(2, r.mechanism.q.order(virtual_displacements(r.realisation)))
     start = sum(row.order for row in r.original.values()) + of_balances * (r.mechanism.q.n - len(r.original))
     assert sum(row.order for row in r.rows) <= start - len(r.hidden)
-    assert all(" with " in row.story for row in r.hidden)
+    assert all(" with " in row.derivation for row in r.hidden)

@@ -25,7 +25,7 @@ from servoctl.methods.stability import sampled_bound
 from servoctl.plants.plant import Plant
 from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
-from servoctl.reduction.realisation import wished
+from servoctl.reduction.realisation import desired_actuation
 from servoctl.run import Run
 
 PLAN_POINTS = 129  # states of the plan at which a choice of rows must be regular
@@ -48,7 +48,7 @@ def linearise(plan, plant):
     points = _points(plan, plant), (along, _plant_states(plan, plant, along))
     extension = _Extension(plant, in_symbols_of(plant, plan.model), *points)
     reduction = plan.model.reduction
-    split, wish = reduction.realisation.actuation, wished(reduction.mechanism, reduction.program)
+    split, wish = reduction.realisation.actuation, desired_actuation(reduction.mechanism, reduction.program)
     if split.shape[0] > split.shape[1] and reduction.mechanism.q.order(split) < 2:
         weights = [ca.SX(reduction.program.weights.get(name, 1.0)) for name in reduction.mechanism.actuators]
         parts = {"split": split, "wish": wish, "weights": ca.vertcat(*weights)}

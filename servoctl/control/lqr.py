@@ -27,7 +27,7 @@ NAMED = 0.05  # share of a state in a mode, of the largest, above which an error
 COMPARED = 8  # samples along the plan at which a combination of states must be conserved
 DOUBLINGS, CONVERGED = 60, 1e-12  # of the horizon of the Riccati equation; relative change at convergence
 LARGEST_RADIUS, LAST_RADIUS = "largest spectral radius along the plan", "spectral radius at its end"
-Q_POSITION, Q_VELOCITY, R_INPUT, Q_INTEGRAL = 1e3, 1e2, 1e-3, 1e4
+Q_POSITION, Q_VELOCITY, R_INPUT, Q_INTEGRAL = 1e3, 1e2, 1e-3, 1e4  # weights by default, in SI units
 
 
 def lqr(

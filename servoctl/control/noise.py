@@ -13,7 +13,7 @@ import numpy as np
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.native import pointer
 
-_WORD = 2**64
+_WORD = 2**64  # values of a word of the counter
 
 
 def key(seed):

@@ -246,7 +246,7 @@ def report(
         structure.index,
         structure.realisation,
         _directions(model, ends),
-        tuple(row.story for row in model.reduction.hidden),
+        tuple(row.derivation for row in model.reduction.hidden),
         model.free,
         None if model.reduction.ideal else self_motion(model.reduction),
         ranks,

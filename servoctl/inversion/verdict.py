@@ -12,7 +12,7 @@ from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.growth import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.methods.choice import Bounded
-from servoctl.methods.kinks import SMOOTHER, kink, stays_on_kink
+from servoctl.methods.kinks import SMOOTHER, kink, stays_on_switch
 from servoctl.model.model import Model, default_start
 from servoctl.model.start import State
 from servoctl.model.variants import strong_near
@@ -254,7 +254,7 @@ def _on_switch(model, motion, why):
     """The verdict where the program rests on a kink: by the growth along a run that leaves it."""
     if not isinstance(motion, Run):
         return Verdict(OPEN, why, f"pass a run that leaves it, along which errors are measured, or {SMOOTHER}")
-    if stays_on_kink(model, motion):
+    if stays_on_switch(model, motion):
         return Verdict(OPEN, f"{why}; the run stays there", f"{SMOOTHER}, or begin off it")
     internal = internal_dynamics(motion)
     return _along(internal, why, {"internal": internal})

@@ -22,7 +22,7 @@ from servoctl.values import frozen
 
 ORDERS = {"RK4": 4, "RK8": 8}
 """Order of each Runge-Kutta method: the classical one of Kutta (1901), and that of Prince and Dormand (1981)."""
-RADAU_ORDERS = (5, 9, 13)
+RADAU_ORDERS = (5, 9, 13)  # of RadauIIA, with 3, 5 and 7 stages
 SCIPY = ("RK45", "DOP853", "Radau", "LSODA")
 EXPLICIT = ("RK45", "DOP853")
 SMALLEST_RTOL = 100 * np.finfo(float).eps  # that scipy's methods except LSODA accept: they replace a smaller one

@@ -29,7 +29,7 @@ def kink(model, t, x):
     return ""
 
 
-def stays_on_kink(model, run):
+def stays_on_switch(model, run):
     """The switch on which a run lies from start to end, without a linearisation, in words; "" if there is none."""
     if switching(model) is None:
         return ""

@@ -197,7 +197,7 @@ class Monitor:
         self.reference, self.lift = None, 1.0
         self.earlier = () if before is None else (*(m for m in before.earlier if m is not model), before.model)
         self.balances = list(balances(model.reduction))
-        self.stories = [{row.name: row.story for row in model.reduction.rows}, {}]
+        self.derivations = [{row.name: row.derivation for row in model.reduction.rows}, {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
         self.m, self.start = len(invariant_names(model)), (t, np.array(x))
         if before is not None:
@@ -263,7 +263,7 @@ class Monitor:
         for i, names in enumerate((self.l_names, self.b_names)):
             old = dict(zip((before.l_names, before.b_names)[i], before.rows[i], strict=True))
             for j, name in enumerate(names):
-                if name in old and self.stories[i].get(name) == before.stories[i].get(name):
+                if name in old and self.derivations[i].get(name) == before.derivations[i].get(name):
                     self.rows[i][j] = old[name]
         self.largest = np.maximum(self.largest, before.largest)
         now = self._smallest(self.matrices)
@@ -591,7 +591,7 @@ class Monitor:
     def _advice(self, lost):
         """What to do where rows lose their rank: as designed rows can be written otherwise, derived ones cannot."""
         r = self.model.reduction
-        as_written = (row for row in r.rows if row.name in r.original and not row.story)
+        as_written = (row for row in r.rows if row.name in r.original and not row.derivation)
         written = {row.name: row.order for row in as_written if row.name in lost}
         actuators, residuals = r.mechanism.actuators, r.program.residuals
         if written and not any(written.values()):

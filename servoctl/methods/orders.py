@@ -5,7 +5,7 @@ from servoctl.model.variants import derived_near
 from servoctl.reduction.orders import other_order
 
 
-def end_at_other_orders(motion):
+def end_where_orders_change(motion):
     """Cut a motion in place before the first sample at which a row has another order, and set the error as its stop."""
     for model, t, jets in motion.by_piece():
         k, name = model.reduction.orders.first_change(t, jets, model.parameters)

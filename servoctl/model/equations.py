@@ -456,7 +456,7 @@ def _level_name(name, j):
 
 def residual_rows(reduction):
     """Rows whose residuals a run reports, by name."""
-    hidden = {f"hidden: {row.name}": row for row in reduction.rows if row.story}
+    hidden = {f"hidden: {row.name}": row for row in reduction.rows if row.derivation}
     return {**reduction.original, **hidden}
 
 
@@ -492,7 +492,7 @@ def balances(reduction):
     """The coordinate or quasi-velocity, by index, of each row of L that is a row TᵀM of (3.18), by index."""
     names = [f"balance of {name}" for name in reduction.mechanism.q.force_names]
     rows = enumerate(monitored_rows(reduction))
-    return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.story}
+    return {a: names.index(row.name) for a, row in rows if row.name in names and row.order == 2 and not row.derivation}
 
 
 def monitored_rows(reduction):

@@ -63,10 +63,12 @@ def _raised(model, r, room):
 
 
 def _hidden(model, r, room):
-    stories = [row.story for row in r.hidden]
-    if not stories:
+    derivations = [row.derivation for row in r.hidden]
+    if not derivations:
         return "no hidden constraint"
-    return f"{len(stories)} hidden constraint{'s' * (len(stories) > 1)} ({listed(stories, room, apart='; ')})"
+    return (
+        f"{len(derivations)} hidden constraint{'s' * (len(derivations) > 1)} ({listed(derivations, room, apart='; ')})"
+    )
 
 
 def _free(model, r, room):

@@ -117,7 +117,8 @@ def _division(model, t, x, chosen, least):
     size = "zero" if part <= RESOLVED else f"{part:.1g} of its usual size"
     raised = [name for name, k in row.uses.items() if k and name in r.original]
     return SingularProgram(
-        f"At t = {t:.7g} s the hidden constraint {row.name!r} ({row.story}) divides by {shown(pivot)}, which is {size} "
+        f"At t = {t:.7g} s the hidden constraint {row.name!r} ({row.derivation}) divides by {shown(pivot)}, "
+        f"which is {size} "
         "where the program holds there.",
         "A hidden constraint combines derivatives of residuals, and says nothing where its divisor vanishes.",
         nearest="" if later is None else f"t = {later:g} s, where it is larger.",
@@ -134,7 +135,10 @@ def _division(model, t, x, chosen, least):
 
 def _divisors(model, variant, t, x):
     """The (row, divisor) of a variant's hidden constraints; sizes of these at t [s], X = x relative to usual ones."""
-    hidden, usual = {f"combination of {row.story}": row for row in variant.reduction.hidden}, model.reduction.points
+    hidden, usual = (
+        {f"combination of {row.derivation}": row for row in variant.reduction.hidden},
+        model.reduction.points,
+    )
     divisors = [(hidden[name], pivot) for name, pivot in variant.reduction.pivots if name in hidden]
     if not divisors:
         return [], np.zeros(0)

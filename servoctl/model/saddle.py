@@ -24,7 +24,7 @@ CLOSE = 1.1  # ratio of operations up to which the forms are compared after comm
 def applies(reduction):
     """Whether the balance and the constraints determine γ'': s̄ = 2, and no row of (3.18) is differentiated."""
     dynamics = [row for row in reduction.rows if row.kind == "dynamics"]
-    return reduction.top == 2 and all(row.order == 2 and not row.story for row in dynamics)
+    return reduction.top == 2 and all(row.order == 2 and not row.derivation for row in dynamics)
 
 
 def solve(equations, poles=False):

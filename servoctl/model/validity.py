@@ -14,7 +14,7 @@ from servoctl.codegen.function import GRID_POINTS, compiled
 from servoctl.jets.branches import sizes_of_terms
 from servoctl.model.equations import invariant_names
 from servoctl.reduction.appell import NEGATIVE
-from servoctl.reduction.manifold import ON_MANIFOLD, at_usual_size, gradient_scales, least_steps
+from servoctl.reduction.manifold import ON_MANIFOLD, at_nominal_size, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
 from servoctl.reduction.reduce import HELD, WEAKER, strong
 from servoctl.tolerances import ENTRY, TINY
@@ -221,7 +221,7 @@ def _valid(model, known, t, z, values):
     left, of_left = found["conditions"]
     if not (np.abs(left) <= HELD * np.maximum(of_left, TINY)).all():  # a velocity that is kept at zero is rounding
         sizes = r.points.sizes(r.top) * r.points.factorials(r.top)
-        of_left = np.maximum(of_left, at(at_usual_size(z, sizes, model.nq))["conditions"][1])
+        of_left = np.maximum(of_left, at(at_nominal_size(z, sizes, model.nq))["conditions"][1])
     checks = (
         dead,
         strong(clean(*found["pivots"]), known.pivots[:, None, None]),

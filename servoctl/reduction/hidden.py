@@ -68,7 +68,7 @@ def complete(q, rows, context, starts=None, most=None, so_far=None):
         if combination.row.order < 0:
             raise _dependent(q, rows, combination)
         rows[combination.replaces] = replace(combination.row, parts=())
-        pivots += [(f"combination of {combination.row.story}", pivot) for pivot in combination.pivots]
+        pivots += [(f"combination of {combination.row.derivation}", pivot) for pivot in combination.pivots]
 
 
 @frozen
@@ -123,7 +123,7 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
     parts, pivots = _combine(q, rows, b, others, top, numbers)
-    story = told(rows[b], [rows[a] for a in others], top)
+    derivation = in_words(rows[b], [rows[a] for a in others], top)
     uses = combined_uses([rows[a] for a in support])
     vanishing = sum((rows[a].vanishing for a in support), ())
     expression = cse(sum(parts))
@@ -131,7 +131,7 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     row, points = settle(q, chi, rows[:b] + rows[b + 1 :], context, starts)
     if row is None:
         raise _no_state(q, rows[:b] + rows[b + 1 :], context)
-    return _Combination(replace(row, story=story), b, support, points, pivots, chi)
+    return _Combination(replace(row, derivation=derivation), b, support, points, pivots, chi)
 
 
 def _slopes_beside(q, rows, combination, context):
@@ -173,7 +173,9 @@ def _divided(q, rows, combination, context):
     points = sample(q, [*rest, row], level, context, starts=points)
     if not len(points.t) or np.any(clean(*values_and_sizes(whole, points))):
         raise vanishing_gradient(rows[b])
-    return replace(combination, row=replace(row, story=f"{combination.row.story}, divided by {jet}"), points=points)
+    return replace(
+        combination, row=replace(row, derivation=f"{combination.row.derivation}, divided by {jet}"), points=points
+    )
 
 
 def _beside_manifold(q, rows, b, context):
@@ -209,7 +211,7 @@ def _combine(q, rows, b, others, top, numbers):
     return parts, [p for p in pivots if ca.symvar(p)]
 
 
-def told(row, others, top):
+def in_words(row, others, top):
     """The combination of a row with derivatives of others to an order, in words."""
     names = [_derivative_name(other, top - other.order) for other in others]
     return f"{row.name} with {', '.join(names)}" if names else row.name
@@ -234,35 +236,36 @@ def _require_affine(rows, support, top):
 
 def _dependent(q, rows, combination):
     """The error of rows whose combination depends on t alone."""
-    names, story = [rows[a].name for a in combination.support], combination.row.story
+    names, derivation = [rows[a].name for a in combination.support], combination.row.derivation
     zero = not np.any(clean(*values_and_sizes(combination.row, combination.points)))
     listed = ", ".join(names)
     if any(rows[a].kind == "dynamics" for a in combination.support):
         program = [name for name in names if name != combination.row.name] or names
         return NotRealisable(
-            f"No derivative of the program contains the actuation: the combination {story} "
+            f"No derivative of the program contains the actuation: the combination {derivation} "
             + ("vanishes identically." if zero else "depends on t alone and is not zero."),
             "Every residual needs an actuator that moves it.",
             do=f"Change the actuators or the rows {', '.join(program)}.",
             rows=names,
-            combination=story,
+            combination=derivation,
         )
     if zero:
         if _independent_in_q(q, [rows[a] for a in combination.support], combination.points):
             return _beyond_velocities(q, names)
         return SpecificationError(
-            f"The constraints {listed} are dependent: the combination {story} vanishes identically.",
+            f"The constraints {listed} are dependent: the combination {derivation} vanishes identically.",
             "Constraints must be independent of each other.",
             do=f"Remove one of {listed}, or divide it by a factor that the others keep at zero.",
             rows=names,
-            combination=story,
+            combination=derivation,
         )
     return SpecificationError(
-        f"The constraints {listed} contradict each other: the combination {story} depends on t alone and is not zero.",
+        f"The constraints {listed} contradict each other: the combination {derivation} depends on t alone and "
+        "is not zero.",
         "Constraints must have a common solution.",
         do=f"Correct one of {listed}.",
         rows=names,
-        combination=story,
+        combination=derivation,
     )
 
 

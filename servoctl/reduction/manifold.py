@@ -113,7 +113,7 @@ class Points:
         return some
 
 
-def at_usual_size(jets, sizes, nq):
+def at_nominal_size(jets, sizes, nq):
     """Jets (nz, N) with velocities and higher levels of at least their usual sizes (nz,); rows need not hold there."""
     small = (np.abs(jets) < sizes[:, None]) & (np.arange(len(jets)) >= nq)[:, None]
     return np.where(small, sizes[:, None], jets)

@@ -1,7 +1,7 @@
 """Whether what the orders of rows rest on still vanishes, at other parameters or along a motion.
 
 A slope that vanishes where a row is derived lowers the row's order. If it does not vanish identically, it may come
-alive: a gear that is blended in at 3 s, a coupling beyond x = 2, a parameter that was zero. It then counts against the
+active: a gear that is blended in at 3 s, a coupling beyond x = 2, a parameter that was zero. It then counts against the
 terms of the row, times the size of the jet in which it is the slope, both the largest of the motion so far.
 """
 
@@ -56,7 +56,7 @@ class Orders:
         if not self:
             return True
         jets, terms = self._usual(points)
-        return not self._alive(points, np.maximum(jets, 1.0), terms, ENTRY, ENTRY).any()
+        return not self._active(points, np.maximum(jets, 1.0), terms, ENTRY, ENTRY).any()
 
     def first_change(self, t, jets, values):
         """The first sample of a motion at which the order of a row is another one: its index, and the row's name.
@@ -72,15 +72,15 @@ class Orders:
             np.maximum.accumulate(np.maximum(there, here), axis=1)
             for there, here in zip(self._usual(self._on_manifold(self.points)), self._sizes(points), strict=True)
         )
-        suspects = np.flatnonzero(self._alive(points, jets, terms, DRIFTED, DRIFTED).any(axis=0))
+        suspects = np.flatnonzero(self._active(points, jets, terms, DRIFTED, DRIFTED).any(axis=0))
         if not len(suspects):
             return None, ""
         there = self._on_manifold(points.take(suspects))
-        alive = self._alive(there, jets[:, suspects], terms[:, suspects], ENTRY, DRIFTED)
-        confirmed = np.flatnonzero(alive.any(axis=0))
+        active = self._active(there, jets[:, suspects], terms[:, suspects], ENTRY, DRIFTED)
+        confirmed = np.flatnonzero(active.any(axis=0))
         if not len(confirmed):
             return None, ""
-        return int(known[suspects[confirmed[0]]]), self._vanishing[0][int(np.argmax(alive[:, confirmed[0]]))]
+        return int(known[suspects[confirmed[0]]]), self._vanishing[0][int(np.argmax(active[:, confirmed[0]]))]
 
     def _sampled(self, t, jets, values):
         """Points at samples of a motion; jets that it does not have follow from the rows."""
@@ -96,7 +96,7 @@ class Orders:
         """The largest of these sizes over points: two arrays (slopes, 1)."""
         return [size.max(axis=1, keepdims=True, initial=0.0) for size in self._sizes(points)]
 
-    def _alive(self, points, jets, terms, rounding, share):
+    def _active(self, points, jets, terms, rounding, share):
         """Whether slopes (slopes, N) exceed their rounding, and times their jets a share of the terms of their row."""
         values, sizes = np.abs(points.evaluate(self._vanishing[1][0]))
         return (values > rounding * sizes) & (values * jets > share * terms)
@@ -117,7 +117,7 @@ def other_order(row, t, free=None, expected=None):
     changes = free not in (None, expected)
     there = f", and from there on {free} initial values are free instead of {expected}" if changes else ""
     return SingularProgram(
-        f"The order of row {row!r} changes at t = {t:.6g} s: terms come alive that vanish where it was derived{there}.",
+        f"The order of row {row!r} changes at t = {t:.6g} s: terms are active that vanish where it was derived{there}.",
         "The rows of a motion keep their orders along it.",
         do="Derive two models, one for each regime, with guess={...} in each, and join their motions.",
         t=t,

@@ -323,7 +323,7 @@ class _System:
                 right[k] = subtract(right[k], multiply(factor, b))
 
 
-_ZERO = ca.SX(0)
+_ZERO = ca.SX(0)  # of entries that are left out
 
 
 def _vanish(entries):

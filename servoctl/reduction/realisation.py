@@ -18,7 +18,7 @@ from servoctl.jets.branches import cse
 from servoctl.reduction.appell import Realisation, plant_solution
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.ranks import clean, decide_all, decide_each
-from servoctl.reduction.rows import balances, settle_alone
+from servoctl.reduction.rows import balances, settle_rows
 from servoctl.spec.coordinates import require_order
 from servoctl.spec.mechanism import inverse_directions
 
@@ -51,14 +51,14 @@ def realisation(mechanism, program, constraints, points, context):
     return _shared(mechanism, program, constraints, independent, points, context)
 
 
-def wished(mechanism, program):
+def desired_actuation(mechanism, program):
     """u_wish, (m,) SX."""
     return ca.vertcat(*(ca.SX(program.toward.get(name, 0.0)) for name in mechanism.actuators))
 
 
-def wished_balance(mechanism, program):
-    """The balance under the wished actuation, r - E u_wish, (n,) SX: what the reaction B μ holds."""
-    return mechanism.balance - mechanism.E @ wished(mechanism, program)
+def desired_balance(mechanism, program):
+    """The balance under the desired actuation, r - E u_wish, (n,) SX: what the reaction B μ holds."""
+    return mechanism.balance - mechanism.E @ desired_actuation(mechanism, program)
 
 
 def _realised(mechanism, constraints, directions, actuation, points, among=None, **settled):
@@ -91,7 +91,7 @@ def _shared(mechanism, program, constraints, independent, points, context):
     material = [row for row in constraints if row.kind == "material"]
     reached = _realised(mechanism, constraints, mechanism.E[:, independent], None, points)
     unreached, of_split = reached.dynamics(mechanism.balance)
-    rows = [*constraints, *(row for row, _ in settle_alone(q, balances(q, unreached), context))]
+    rows = [*constraints, *(row for row, _ in settle_rows(q, balances(q, unreached), context))]
     rows, _, points, pivots = complete(q, rows, context, points)
     of_split = of_split if reached.independent else []  # nothing is divided where all balances are reached
     pivots = [*((f"choice of unreached balances {i}", p) for i, p in enumerate(of_split, 1)), *pivots]

@@ -15,11 +15,11 @@ from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points, at_usual_size, sample
+from servoctl.reduction.manifold import Context, Points, at_nominal_size, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
-from servoctl.reduction.realisation import realisation, wished, wished_balance
-from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_alone
+from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
+from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_rows
 from servoctl.reduction.scales import ORDINARY, usual
 from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -88,7 +88,7 @@ class Reduction(Packed):
     @property
     def hidden(self):
         """The rows that are hidden constraints."""
-        return tuple(row for row in self.rows if row.story)
+        return tuple(row for row in self.rows if row.derivation)
 
     @property
     def raised(self):
@@ -140,8 +140,8 @@ class Reduction(Packed):
 
     @cached_property
     def balance(self):
-        """The balance under the wished actuation, (n,) SX."""
-        return wished_balance(self.mechanism, self.program)
+        """The balance under the desired actuation, (n,) SX."""
+        return desired_balance(self.mechanism, self.program)
 
     @cached_property
     def flow(self):
@@ -159,7 +159,7 @@ class Reduction(Packed):
         k = len(self.program.residuals)
         multipliers = self.multipliers[:k] if k else ca.SX(0, 1)
         if self.program.by == "actuators":
-            return cse(wished(self.mechanism, self.program) + self.realisation.actuation @ multipliers)
+            return cse(desired_actuation(self.mechanism, self.program) + self.realisation.actuation @ multipliers)
         return cse(self.realisation.B[:, :k] @ multipliers)
 
 
@@ -190,7 +190,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     program = require_parts(mechanism, program, guess)
     q = mechanism.q
     names = q.force_names
-    balance = wished_balance(mechanism, program)
+    balance = desired_balance(mechanism, program)
     forces = dict(zip(map(Balance, names), balance.elements(), strict=True))
     switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
@@ -219,7 +219,7 @@ def _reduced(mechanism, program, switches, balance, context):
     constraints, points, of_constraints = _constraints(mechanism, program, original, context)
     realised, points, of_sharing = realisation(mechanism, program, constraints, points, context)
     dynamics, of_split = realised.dynamics(balance)
-    dynamics = [row for row, _ in settle_alone(q, balances(q, dynamics), context)]
+    dynamics = [row for row, _ in settle_rows(q, balances(q, dynamics), context)]
     _require_motion(dynamics, program)
     rows = [*(realised.settled or constraints), *dynamics]
     solve = complete if realised.settled else completed
@@ -256,7 +256,7 @@ def holds(reduction, values):
     if not strong(now.min(axis=1), before.min(axis=1)).all():
         return False
     left, sizes = points.evaluate(r.conditions)
-    usual = replace(points, z=at_usual_size(points.z, points.sizes(points.level), q.nq))
+    usual = replace(points, z=at_nominal_size(points.z, points.sizes(points.level), q.nq))
     sizes = np.maximum(sizes, usual.evaluate(r.conditions)[1])  # a velocity that the program keeps at zero is rounding
     return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
 

@@ -52,7 +52,7 @@ class Row:
     name: str
     kind: str  # its origin: "program", "material" or "dynamics"
     affine: bool = True  # in γ^(order)
-    story: str = ""  # the combination that it is, if it is a hidden constraint
+    derivation: str = ""  # the combination that it is, if it is a hidden constraint
     uses: dict = field(default_factory=dict)  # highest derivative of each residual, and of the balance, in ψ
     parts: tuple = field(default=(), repr=False, compare=False)  # SX
     vanishing: tuple = field(default=(), repr=False)  # (SX, SX, SX) each
@@ -83,12 +83,12 @@ class Row:
     def resting_on(self, slopes, jets):
         """The row, with slopes in jets among `vanishing` that are zero at points, unless they vanish identically."""
         pairs = [(e, jet) for e, jet in zip(slopes.elements(), jets.elements(), strict=True) if not e.is_zero()]
-        alive = ~vanish(spread([e for e, _ in pairs])) if pairs else []
-        some = tuple((e, jet, self.expression) for (e, jet), live in zip(pairs, alive, strict=True) if live)
+        live = ~vanish(spread([e for e, _ in pairs])) if pairs else []
+        some = tuple((e, jet, self.expression) for (e, jet), one in zip(pairs, live, strict=True) if one)
         return replace(self, vanishing=self.vanishing + some) if some else self
 
     def __repr__(self):
-        return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.story if self.story else ''})"
+        return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.derivation if self.derivation else ''})"
 
 
 def balances(q, expressions):
@@ -127,7 +127,7 @@ def as_rows(q, named, kind, context):
     gradient vanishes wherever the residual does.
     """
     rows = [Row(q.on_spheres(e), max(q.order(e), 0), name, kind, uses={name: 0}) for name, e in named.items()]
-    settled = settle_alone(q, rows, context)
+    settled = settle_rows(q, rows, context)
     for row, slopes in settled:
         if row.order < 0:
             raise SpecificationError(
@@ -253,7 +253,7 @@ def leading(q, rows, points):
     return clean(values, sizes), sizes
 
 
-def settle_alone(q, rows, context):
+def settle_rows(q, rows, context):
     """The true order of each row by itself; see `settle`.
 
     For most rows one evaluation of all leading gradients decides, and `settle` treats the rest. Each row comes with the

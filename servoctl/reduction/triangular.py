@@ -14,7 +14,7 @@ from servoctl.errors import ServoError
 from servoctl.jets.branches import cse
 from servoctl.jets.identity import spread, vanish
 from servoctl.reduction.cascade import Block, Cascade
-from servoctl.reduction.hidden import Deep, complete, told
+from servoctl.reduction.hidden import Deep, complete, in_words
 from servoctl.reduction.ranks import clean, decide_each, generic
 from servoctl.reduction.rows import dependence, leading, merge_uses
 from servoctl.tolerances import DEPENDENT, ENTRY
@@ -112,27 +112,27 @@ def _with_uses(q, rows, cascade, points):
             uses = [(other.uses, max(order - other.order, 0)) for m, order in jets.items() for other in blocks[m].rows]
             of_block.append(replace(row, uses=merge_uses((row.uses, 0), *uses)))
         pairs = dict(zip(block.places, of_block, strict=True))
-        known |= {a: row for a, row in pairs.items() if not row.story}
+        known |= {a: row for a, row in pairs.items() if not row.derivation}
         open_ = [a for a in block.places if k or a not in known]
         while open_:
-            stories = {a: _story(q, pairs[a], rows[a], known, points) for a in open_}
-            told_now = {a for a in open_ if stories[a]} or set(open_)
-            pairs |= {a: replace(pairs[a], story=stories[a] or pairs[a].story) for a in told_now if k}
+            derivations = {a: _derivation(q, pairs[a], rows[a], known, points) for a in open_}
+            told_now = {a for a in open_ if derivations[a]} or set(open_)
+            pairs |= {a: replace(pairs[a], derivation=derivations[a] or pairs[a].derivation) for a in told_now if k}
             known |= {a: pairs[a] for a in told_now}
             open_ = [a for a in open_ if a not in told_now]
         blocks.append(replace(block, rows=tuple(pairs.values())))
     return replace(cascade, blocks=tuple(blocks))
 
 
-def _story(q, row, whole, known, points):
+def _derivation(q, row, whole, known, points):
     """The combination of the `whole` row and known rows, by place, by which a row's order is lower; "" for none."""
     others = sorted(known.items(), key=lambda pair: (pair[1].kind == "dynamics", pair[1].order, pair[0]))
     others = [other for _, other in others if other.name != row.name]
     if row.order == whole.order:
-        return row.story
+        return row.derivation
     values = [clean(*points.matrix(other.gradient(q))) for other in [*others, whole]]
     support, _ = dependence(np.concatenate(values), first=len(others))
-    return told(row, [others[a] for a in support[:-1]], whole.order) if support else ""
+    return in_words(row, [others[a] for a in support[:-1]], whole.order) if support else ""
 
 
 def _determines(q, block):

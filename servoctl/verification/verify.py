@@ -133,10 +133,8 @@ def _required(run):
 def _variants(model, run, count):
     """Ranges of samples and their variants, of this model itself: a run says on which sides and near which places."""
     with contextlib.suppress(ServoError, LookupError, TypeError, ValueError):
-        made = [
-            (a, min(b, count), variant_at(on_side(model, sides(model, v)), place_of(v))) for a, b, v in run.variants
-        ]
-        made = [variant for variant in made if variant[0] < count]
+        there = [(a, b, on_side(model, sides(model, v)), place_of(v)) for a, b, v in run.variants if a < count]
+        made = [(a, min(b, count), variant_at(side, place)) for a, b, side, place in there]
         if [0, *(end for _, end, _ in made)] == [*(first for first, *_ in made), count]:
             return tuple(made)
     return ((0, count, model),)

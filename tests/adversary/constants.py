@@ -1,7 +1,7 @@
 """Constants that decide, ten times larger and ten times smaller: do tests see it?
 
 `python tests/adversary/constants.py methods/monitor.py HIDES SHARE --tests test_monitor.py` prints a line for each
-value. A test that fails pins the constant from that side; docs/numbers.md names it.
+value. A test that fails pins the constant from that side; tests/pinned.txt names it.
 """
 
 import argparse

@@ -242,7 +242,7 @@ def test_the_size_of_a_balance_decides_nothing(length, mass):
     mechanism, program = gallery["flexible-joint"].build()
     plain = sv.derive(mechanism, program)
     other = sv.derive(*in_units(mechanism, program, mechanism.units, length, mass))
-    assert [(r.story, r.order) for r in other.reduction.rows] == [(r.story, r.order) for r in plain.reduction.rows]
+    assert [(r.derivation, r.order) for r in other.reduction.rows] == [(r.derivation, r.order) for r in plain.reduction.rows]
     x = plain.start(t=0.4).values
     assert other.start(t=0.4).values == pytest.approx(x, abs=1e-9 * np.abs(x).max())
 
