@@ -33,7 +33,7 @@ or to the largest value that a quantity takes nearby. A change of units changes 
 
 def numeric(node):
     """Whether an expression contains numbers and no texts: 1e-9, (0.1, 0.3), 64 * EPS."""
-    if any(isinstance(each, ast.Dict | ast.List | ast.Set | ast.Lambda) for each in ast.walk(node)):
+    if any(isinstance(each, ast.Dict | ast.Set | ast.Lambda) for each in ast.walk(node)):
         return False
     values = [type(each.value) for each in ast.walk(node) if isinstance(each, ast.Constant)]
     return bool(values) and {*values} <= {int, float}
