@@ -8,11 +8,12 @@ from types import MappingProxyType
 import numpy as np
 
 from servoctl import archive
-from servoctl.checks import antiderivative, finite, named, rows_read, whole
+from servoctl.checks import antiderivative, finite, named, require_kind, rows_read, whole
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
 from servoctl.model.equations import residual_names, signal_groups
 from servoctl.model.jets import extended, jet_names_to
+from servoctl.model.model import Model
 from servoctl.model.start import State, without_rounding
 from servoctl.model.switching import switching
 from servoctl.model.variants import place_of, variant_at
@@ -584,13 +585,7 @@ def _event_at(arrays, i, own):
 
 def of_model(run, facts, model):
     """A loaded run with its model, which must give the signals of the file."""
-    if not hasattr(model, "signal_groups"):
-        raise SpecificationError(
-            f"load received model={type(model).__name__}.",
-            "A run is loaded with its model, or without one.",
-            do="Pass the value of sv.derive(mechanism, program).",
-            model=type(model).__name__,
-        )
+    require_kind(Model, "model", model, "sv.derive(mechanism, program)")
     numbers, names = facts.get("parameters"), jet_names_to(model, len(run.jets))
     off = {name: (value, model.numbers.get(name)) for name, value in (numbers or {}).items()}
     off = {name: pair for name, pair in off.items() if pair[0] != pair[1]}

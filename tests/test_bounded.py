@@ -399,5 +399,5 @@ def test_what_bounded_motions_do_not_take_is_refused(gallery_model):
     with refused(IntegrationStopped, "equilibrium"):
         sv.simulate(wheel, wheel.start(**gallery["appell-hamel"].start), (0.0, 1.0), sv.methods.Bounded())
     for window in (0.0, -1.0, 1e4, "long", None):
-        with refused(SpecificationError, "window", window=window):
+        with refused(SpecificationError, "window", name="window", value=window):
             sv.methods.Bounded(window)

@@ -13,6 +13,7 @@ from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.equations import invariant_names, signal_groups
+from servoctl.model.model import knots_within
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
@@ -377,7 +378,7 @@ def _knot_rate(model, run, name, t):
     value, ends = model.numbers[name], (start_of(run)[0], float(run.t[-1]))
     span = min(ends), max(ends)
     shift = SHIFT * (abs(value) or 1.0)
-    knots = [np.array(model.with_parameters(**{name: value + h}).require_smooth(span)) for h in (-shift, shift)]
+    knots = [np.array(knots_within(model.with_parameters(**{name: value + h}), span)) for h in (-shift, shift)]
     nearest = [k[np.argmin(np.abs(k - t))] if len(k) else np.nan for k in knots]
     return (nearest[1] - nearest[0]) / (2 * shift)
 
