@@ -273,3 +273,18 @@ def test_inertia_of_many_cases_is_that_of_each(name):
             equations.require_inertia(case)
         except sv.errors.SpecificationError:
             assert not sound
+
+
+@pytest.mark.parametrize("angle", [0.0, np.pi])
+def test_rods_that_hang_or_stand_in_line_move(angle):
+    """Where both rods are vertical their gradients have no x and no u, which cannot depend on the others there."""
+    q = sv.coordinates("x y u v")
+    x, y, u, v = q
+    masses = sv.particle(q, 1.0, (x, y)) + sv.particle(q, 1.0, (u, v))
+    rods = {"upper": x**2 + y**2 - 1, "lower": (u - x) ** 2 + (v - y) ** 2 - 1}
+    mechanism = sv.Mechanism(q, masses, potential=9.81 * (y + v), constraints=rods, actuators={"F": x, "G": u})
+    down = -np.cos(angle)
+    plant = sv.plant(mechanism)
+    run = sv.simulate(plant, [0.0, down, 0.0, 2 * down, 0.0, 0.0, 0.0, 0.0], (0.0, 0.3), inputs={"F": 0.1, "G": 0.2})
+    assert run.success and sv.verify(run).passed
+    assert [run["d2x"][0], run["d2u"][0]] == pytest.approx([0.1, 0.2], abs=1e-9)

@@ -452,3 +452,23 @@ def test_a_plant_without_constraints_crosses_switches(method):
     mechanism = sv.Mechanism(q, kinetic=kinetic, potential=x**2 / 20, actuators={"F": x, "G": y})
     inputs = {"F": lambda t: 0.3 * ca.sin(t), "G": 0.2}
     assert sv.simulate(sv.plant(mechanism), [1.0, 0.0, 1.5, 0.4], (0.0, 3.0), method, inputs=inputs).success
+
+
+def far_blend(name):
+    """A coupling that is zero to all digits where it is derived."""
+    return {"split logistic": lambda x: 0.5 * (1 - 1 / (1 + np.exp(-90.0) * ca.exp(30 * x))),
+            "far away": lambda x: 0.5 * (1 - 1 / (1 + (x / 1e8) ** 8))}[name]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "x", "dx"), [("split logistic", 1.0, 1.5), ("far away", 1.0, 1e8)])
+def test_what_a_small_number_hides_acts(name, x, dx):
+    """The accelerations of two masses with an inertial coupling c(x), whose balance is written by hand."""
+    q, blend = sv.coordinates("x y"), far_blend(name)
+    kinetic = (q.d(1)[0] ** 2 + q.d(1)[1] ** 2) / 2 + blend(q["x"]) * q.d(1)[0] * q.d(1)[1]
+    plant = sv.plant(sv.Mechanism(q, kinetic=kinetic, actuators={"F": q["x"], "G": q["y"]}))
+    X = ca.SX.sym("x")
+    c, slope = (ca.Function("c", [X], [e]) for e in (blend(X), ca.jacobian(blend(X), X)))
+    for place in (x, 3.1 if name == "split logistic" else 1.2e8):
+        coupling, rate = float(c(place)), float(slope(place))
+        expected = np.linalg.solve([[1.0, coupling], [coupling, 1.0]], [0.3, 0.2 - rate * dx**2])
+        assert plant.rates(0.0, [place, 0.0, dx, 0.0], [0.3, 0.2])[2:] == pytest.approx(expected, rel=1e-9)

@@ -86,7 +86,8 @@ def finish(ax, title="", legend=None, **labels):
     """Labels and limits of a panel, its title, a faint grid, and its legend where that has a place: {} for the best."""
     ax.set(**labels)
     ax.grid(alpha=0.3)
-    ax.set_title(title, fontsize=10)
+    if title:
+        ax.set_title(title, fontsize=10)
     if legend is not None:
         ax.legend(fontsize=9, **legend)
 

@@ -7,6 +7,7 @@ functions are. Sines, cosines, roots and powers, whose identities mechanics need
 either branch.
 """
 
+import casadi as ca
 import numpy as np
 
 from servoctl.jets.tape import REAL, VALUE, Tape, apply, evaluate
@@ -63,7 +64,20 @@ def spread(expressions):
     return np.where(np.abs(values) <= ENTRY * sizes, 0.0, values).astype(float)
 
 
+def identical_zeros(expressions):
+    """Which of some SX scalars vanish identically: so do their slopes, which show what is too small to be seen.
+
+    A small number before a function that is replaced, as e^-90 before e^30x, is lost beside 1, but is a factor of the
+    slope.
+    """
+    zeros = vanish(spread(expressions)) if expressions else np.zeros(0, dtype=bool)
+    for i in np.flatnonzero(zeros):
+        slopes = ca.gradient(expressions[i], ca.vertcat(*ca.symvar(expressions[i]))).nonzeros()
+        zeros[i] = not slopes or vanish(spread(slopes)).all()
+    return zeros
+
+
 def vanish(values):
-    """Whether expressions vanish identically, from values at points (..., points) as those of `spread`."""
+    """Whether expressions vanish identically at points, from values at points (..., points) as those of `spread`."""
     finite = np.isfinite(values)
     return (finite.sum(axis=-1) >= IN_DOMAIN) & ~np.any(finite & (values != 0), axis=-1)

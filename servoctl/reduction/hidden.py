@@ -229,7 +229,7 @@ def _require_affine(rows, support, top):
             f"The residual {nonlinear[0]!r} is nonlinear in its highest derivative and depends on other rows there.",
             "Hidden constraints are derived from rows that are linear in their highest derivatives.",
             do=f"Program the time derivative of {nonlinear[0]!r}, which is linear in its highest derivative, and start "
-            "where the residual is zero.",
+            "where the residual is zero; or divide it by a factor that the others keep at zero.",
             rows=nonlinear,
         )
 
@@ -254,7 +254,7 @@ def _dependent(q, rows, combination):
             return _beyond_velocities(q, names)
         return SpecificationError(
             f"The constraints {listed} are dependent: the combination {derivation} vanishes identically.",
-            "Constraints must be independent of each other.",
+            "Constraints must be independent of each other, and each has a gradient where it holds.",
             do=f"Remove one of {listed}, or divide it by a factor that the others keep at zero.",
             rows=names,
             combination=derivation,

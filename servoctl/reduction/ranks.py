@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram
-from servoctl.jets.identity import spread, vanish
+from servoctl.jets.identity import identical_zeros
 from servoctl.jets.tape import divide, multiply, subtract
 from servoctl.tolerances import CUTOFF, ENTRY, NOISE, REFINEMENTS, RESOLVED, TINY
 from servoctl.values import frozen
@@ -240,7 +240,7 @@ class _System:
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
         doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
-        vanishing = _vanish([entry for _, _, entry in doubtful])
+        vanishing = identical_zeros([entry for _, _, entry in doubtful])
         zeros = {(i, j) for (i, j, _), zero in zip(doubtful, vanishing, strict=True) if zero}
         self.rows = [{} for _ in range(n)]
         for i, j, entry in entries:
@@ -312,7 +312,7 @@ class _System:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
             left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
-            if not numbers.any() and _vanish([left])[0]:
+            if not numbers.any() and identical_zeros([left])[0]:
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:
@@ -324,11 +324,6 @@ class _System:
 
 
 _ZERO = ca.SX(0)  # of entries that are left out
-
-
-def _vanish(entries):
-    """Whether each of some SX scalars vanishes identically."""
-    return [vanish(values) for values in spread(entries)] if entries else []
 
 
 def _back(value, terms, pivot):

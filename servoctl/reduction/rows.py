@@ -8,7 +8,7 @@ import numpy as np
 
 from servoctl.errors import SingularProgram, SpecificationError
 from servoctl.jets.branches import cse, shown
-from servoctl.jets.identity import spread, vanish
+from servoctl.jets.identity import identical_zeros
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
 from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
@@ -83,7 +83,7 @@ class Row:
     def resting_on(self, slopes, jets):
         """The row, with slopes in jets among `vanishing` that are zero at points, unless they vanish identically."""
         pairs = [(e, jet) for e, jet in zip(slopes.elements(), jets.elements(), strict=True) if not e.is_zero()]
-        live = ~vanish(spread([e for e, _ in pairs])) if pairs else []
+        live = ~identical_zeros([e for e, _ in pairs])
         some = tuple((e, jet, self.expression) for (e, jet), one in zip(pairs, live, strict=True) if one)
         return replace(self, vanishing=self.vanishing + some) if some else self
 
@@ -186,16 +186,16 @@ def _regular_nearby(flow, row, points):
 
 
 def vanishing_gradient(row):
-    """The error of a row without a gradient where it holds; it names a factor that the row has twice."""
+    """The error of a row without a gradient where it holds; it names a factor that the row has more than once."""
     found = factors(row.expression)
     factor = next((f for i, f in enumerate(found) if _among(f, found[:i])), None)
-    because = "" if factor is None else f": it has the factor {shown(factor)} twice"
+    because = "" if factor is None else f": it has the factor {shown(factor)} more than once"
     return SingularProgram(
         f"The gradient of row {row.name!r} vanishes on its own solutions, or has no value there{because}.",
         "A constraint φ = 0 needs a gradient there; φ², |φ| and 1 - cos φ have none, and determine no direction of the "
         "motion.",
         do=f"Write {row.name!r} so that it changes sign, with a gradient, at its solutions: φ in place of φ² or of "
-        "1 - cos φ, and one residual for each direction in place of a distance.",
+        "1 - cos φ, one residual for each direction in place of a distance, and without a factor that is a speed.",
         row=row.name,
         **({} if factor is None else {"factor": shown(factor)}),
     )

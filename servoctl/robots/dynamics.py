@@ -46,7 +46,7 @@ class Kinematics:
         self.along = [axis.parts(axis.value)[1] for axis in axes]
         for body, axis in zip(tree.bodies, axes, strict=True):
             self._place(body, axis)
-            self._move(body, axis)
+            self._move(axis)
 
     def into(self, i, vector):
         """A vector in the parent's axes, in those of body i."""
@@ -77,7 +77,7 @@ class Kinematics:
             self.rotations.append(outer @ inner)
             self.offsets.append(self.offsets[body.parent] + outer @ self.arm(i))
 
-    def _move(self, body, axis):
+    def _move(self, axis):
         i = len(self.omega)
         outer, speed = self.parent(self.omega, i), self.parent(self.speed, i)
         carried = self.into(i, speed + ca.cross(outer, self.arm(i)))
