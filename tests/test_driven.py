@@ -198,3 +198,12 @@ def test_a_plant_of_one_coordinate_moves():
     a, t = 0.35, run.t
     expected = 0.15 + np.exp(-decay * t) * (a * np.cos(rate * t) + (1.0 + decay * a) / rate * np.sin(rate * t))
     assert run["x"] == pytest.approx(expected, abs=1e-8)
+
+
+@pytest.mark.parametrize("name", ["damping", "forces", "mechanism", "limits", "rate_limits", "lag", "delay"])
+def test_a_parameter_may_have_the_name_of_an_option(name):
+    q, p = sv.coordinates("x"), sv.parameters(**{name: 2.0})
+    mechanism = sv.Mechanism(q, sv.particle(q, getattr(p, name), q["x"]), actuators={"F": q["x"]}, parameters=p)
+    program = sv.Program({"path": q["x"] - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=2)})
+    run = sv.relaxed(sv.plant(mechanism), program, (0.0, 1.0))
+    assert np.abs(run["F"]).max() == pytest.approx(2.0 * 10 / np.sqrt(3), rel=0.05)  # of the quintic

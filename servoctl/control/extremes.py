@@ -27,13 +27,13 @@ def excesses(run, limits):
     for name, (low, high) in limits.items():
         (least, t_least), (most, t_most) = extremes(run, name)
         size = size_of_limit(low, high) or max(abs(least), abs(most)) or 1.0
-        yield float((low - least) / size), name, "lower", t_least, least, low
-        yield float((most - high) / size), name, "upper", t_most, most, high
+        for excess, *where in ((low - least, "lower", t_least, least, low), (most - high, "upper", t_most, most, high)):
+            yield np.inf if np.isnan(excess) else float(excess / size), name, *where
 
 
 def size_of_limit(low, high):
-    """The larger finite side of a limit."""
-    return max(abs(side) for side in (low, high) if np.isfinite(side))
+    """The larger finite side of a limit; 0 if there is none."""
+    return max((abs(side) for side in (low, high) if np.isfinite(side)), default=0.0)
 
 
 def sampled_extremes(t, values):

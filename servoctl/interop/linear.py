@@ -63,7 +63,7 @@ def linearise(thing, t, x=None, u=None, *, controller_state=None, rate=None, dis
     """
     require_kind((Model, Plant, Law, Closed), "thing", thing, SYSTEMS)
     given = {"x": x, "u": u, "controller_state": controller_state, "rate": rate}
-    given["disturbed"] = as_list(disturbed) or None
+    given["disturbed"] = None if as_list(disturbed) == [] else disturbed
     valid = next(options for kind, options in OPTIONS.items() if isinstance(thing, kind))
     idle = [name for name, value in given.items() if value is not None and name not in valid]
     without_effect(idle, f"for a {type(thing).__name__}")

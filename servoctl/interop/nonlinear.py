@@ -64,7 +64,7 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     require_kind((Model, Plant, Law, Closed), "thing", thing, SYSTEMS)
     if isinstance(thing, Plant):
         return _plant(thing, system_name(name, "plant"), disturbed, rate, substeps)
-    given = {"rate": rate, "substeps": substeps, "disturbed": as_list(disturbed) or None}
+    given = {"rate": rate, "substeps": substeps, "disturbed": None if as_list(disturbed) == [] else disturbed}
     without_effect([name for name, value in given.items() if value is not None], f"for a {type(thing).__name__}")
     if isinstance(thing, Model):
         return _model(thing, system_name(name, "model"))

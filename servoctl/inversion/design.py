@@ -570,6 +570,7 @@ class NonlinearProgram:
             constraints=inequalities | {"type": "ineq"},
             options={"maxiter": QUADRATIC_PROGRAMS, "ftol": UNCHANGED},
         ).x
+        x = x if np.isfinite(self._evaluated(x)[0][0]) else self._last  # the last one with a motion
         return np.clip(x[: self.k], 0.0, 1.0)
 
     def _evaluated(self, x):
@@ -578,7 +579,7 @@ class NonlinearProgram:
         Without a motion the cost is infinite beside the last inequalities: the line search shortens its step.
         """
         try:
-            self._known = self.cost(x), *self.inequalities(x)
+            self._known, self._last = (self.cost(x), *self.inequalities(x)), np.array(x)
         except ServoError:
             if self._known is None:
                 raise

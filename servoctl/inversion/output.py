@@ -363,7 +363,7 @@ def _edge(polynomial, a, b, first, last):
     def changed(value):
         return -1.0 if polynomial.kind(value)[part] == first[part] else 1.0
 
-    return bisect(changed, a, b, xtol=TINY, rtol=4 * np.finfo(float).eps)
+    return bisect(changed, a, b, xtol=np.finfo(float).eps * (b - a), rtol=4 * np.finfo(float).eps)
 
 
 def _losses(model, t, q0):
@@ -405,7 +405,7 @@ def _first_loss(at, q0, side):
             return 1.0 if np.linalg.slogdet(at(_onto(at, x + part * step))[2])[0] == sign else -1.0
 
         if same(1.0) < 0:
-            return _onto(at, x + bisect(same, 0.0, 1.0, xtol=TINY, rtol=4 * np.finfo(float).eps) * step)
+            return _onto(at, x + bisect(same, 0.0, 1.0, xtol=np.finfo(float).eps) * step)
         x = _onto(at, x + step)
     return None
 

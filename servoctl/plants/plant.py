@@ -73,6 +73,11 @@ def plant(
         For a value outside its range, or a mass matrix that is not positive definite.
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
+    return _made(mechanism, parameters, forces, damping, limits, rate_limits, lag, delay)
+
+
+def _made(mechanism, parameters, forces, damping, limits=None, rate_limits=None, lag=None, delay=0.0):
+    """As `plant`, with the parameters by name, which may be those of its options."""
     actuators = mechanism.actuators
     names = mechanism.q.force_names
     values = mechanism.parameters.values(parameters)
@@ -129,12 +134,12 @@ def made_again(whole, mechanism, **of_actuators):
         mechanism.q.force_names,
         dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True)),
     )
-    return plant(
+    return _made(
         mechanism,
-        forces={name: forces[name] for name in names if not forces[name].is_zero()},
-        damping={name: c for name, c in whole.damping.items() if name in names},
+        dict(zip(mechanism.parameters.names, whole.parameters.tolist(), strict=False)),
+        {name: forces[name] for name in names if not forces[name].is_zero()},
+        {name: c for name, c in whole.damping.items() if name in names},
         **of_actuators,
-        **dict(zip(mechanism.parameters.names, whole.parameters.tolist(), strict=False)),
     )
 
 

@@ -361,7 +361,7 @@ class _Checks:
     def residuals(self):
         """Largest residual of each row at any level, by the relative change of the jets that would remove it."""
         names, _ = self.model.signals("residuals")
-        worst = {f"residual {name}": 0.0 for name in self.run.residual}
+        worst, usual = {f"residual {name}": 0.0 for name in self.run.residual}, np.zeros(len(names))
         for at in self.instants:
             f = at.model.signals("residuals")[1]
             levels, few = at.signals("residuals"), at.few
@@ -372,8 +372,15 @@ class _Checks:
                 levels[:, few],
                 self.sizes[: f.n_x, None],
             )
-            for (name, _), level, size in zip(names, levels, np.median(sizes, axis=1, keepdims=True), strict=True):
+            medians = np.median(sizes, axis=1)
+            usual = np.fmax(usual, medians)
+            for (name, _), level, size in zip(names, levels, medians, strict=True):
                 worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
+        for (name, level), size in zip(names, usual, strict=True):
+            stored, fresh = numbers(self.run.stored_residual.get(name), 2), self.fresh.residual[name]
+            if stored is not None and stored.shape == fresh.shape:
+                off = largest(_ratio(stored[level] - fresh[level], size))
+                worst[f"residual {name}"] = max(worst[f"residual {name}"], off)
         for name in self.model.reduction.mechanism.reported:  # of a program that inputs realise approximately
             del worst[f"residual {name}"]
             self.notes.append(f"the program's residual {name} is at most {largest(self.fresh.residual[name]):.2g}")
