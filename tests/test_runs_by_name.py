@@ -50,7 +50,7 @@ def test_a_run_is_not_loaded_with_another_model(run, tmp_path, gallery_model):
         sv.load(path, model=arm("circle")[0])
     with refused(sv.errors.SpecificationError, "parameters"):
         sv.load(path, model=gallery_model("overhead-crane"))
-    with refused(sv.errors.SpecificationError, "str", model="str"):
+    with refused(sv.errors.SpecificationError, "str", name="model", type="str"):
         sv.load(path, model="spiral")
 
 

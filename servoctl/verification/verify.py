@@ -376,7 +376,7 @@ class _Checks:
             usual = np.fmax(usual, medians)
             for (name, _), level, size in zip(names, levels, medians, strict=True):
                 worst[f"residual {name}"] = max(worst[f"residual {name}"], largest(_ratio(level, size)))
-        for (name, level), size in zip(names, usual, strict=True):
+        for (name, level), size in zip(names, usual, strict=True) if self.run.stored_residual else ():
             stored, fresh = numbers(self.run.stored_residual.get(name), 2), self.fresh.residual[name]
             if stored is not None and stored.shape == fresh.shape:
                 off = largest(_ratio(stored[level] - fresh[level], size))
