@@ -380,3 +380,11 @@ def test_a_plant_is_linearised_along_a_plan_that_has_fewer_coordinates():
         assert system.A == pytest.approx(np.array([[0, 1], [0, 0]])) and system.B[1, 0] == pytest.approx(1 / 3)
     law = list(interop.along(sv.lqr(plan, plant, 50.0), plan, [0.5]))[0]
     assert list(law.input_labels) == list(systems[0].state_labels)
+
+
+@pytest.mark.parametrize("disturbed", ["x", ["x"], {"x": 1.0}])
+def test_disturbances_of_a_model_are_refused_however_they_are_given(disturbed):
+    model = sv.derive(*mass_on_car())
+    with refused(SpecificationError, "disturbed"):
+        interop.nlsys(model, disturbed=disturbed)
+    interop.nlsys(model, disturbed=[])

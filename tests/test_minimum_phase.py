@@ -387,3 +387,14 @@ def test_a_coefficient_counts_above_1e_11(mass, states):
     path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
     model = sv.derive(mechanism, sv.Program({"X": x + p.w * ca.sin(y) ** 2 - path}))
     assert sv.minimum_phase(model, "w", (0.05, 0.15)).eigenvalues(0.1).size == states
+
+
+def test_a_relative_degree_that_is_lost_at_the_rest_itself_is_found():
+    p, q = sv.parameters(w=0.5), sv.coordinates("x y")
+    (x, y), (dx, dy) = q, q.d(1)
+    masses, springs = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y), 2.0 * (x - y) ** 2 + 3.0 * x**2
+    mechanism = sv.Mechanism(q, masses, potential=springs, forces=(-0.1 * dx, -0.1 * dy), actuators={"a": y}, parameters=p)
+    path = sv.paths.rest_to_rest(q.t, 0.0, 0.1, duration=1.0, smoothness=4)
+    found = sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x + p.w * y + y**2 - path})), "w", (-1.0, 1.0))
+    assert [lost["y"] for lost in found.lost(0.5)] == pytest.approx([-0.25])  # where ∂X/∂y = w + 2y vanishes
+    assert all(abs(lost["y"]) < 1e-15 for lost in found.lost(0.0)) and found.lost(0.0)

@@ -514,3 +514,12 @@ def test_weights_fall_by_the_factor_from_the_first_to_the_last(monkeypatch, cran
     falling = np.array(seen[: seen.index(1e-10) + 1])
     assert np.all(falling[:-1] / falling[1:] <= FACTOR * (1 + 1e-9)) and len(falling) > 1
     assert falling[0] / FIRST == pytest.approx(5.0**2 / 130.0**2, rel=0.5)  # stroke²/force²
+
+
+def test_bounds_that_admit_no_motion_are_named():
+    """A metre in a second, from rest to rest, takes more than half a metre per second."""
+    q = sv.coordinates("x")
+    mechanism = sv.Mechanism(q, sv.particle(q, 1.0, q["x"]), actuators={"F": q["x"]})
+    program = sv.Program({"path": q["x"] - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=2)})
+    with pytest.raises((LimitExceeded, IntegrationStopped), match=r"without them dx is 1\.87"):  # by how IPOPT ends
+        sv.relaxed(sv.plant(mechanism), program, (0.0, 1.0), bounds={"dx": 0.5})

@@ -558,3 +558,12 @@ def test_many_variants_of_one_model_are_followed_together(gallery_model, monkeyp
     seen, integrate = [], intervals._integrate
     monkeypatch.setattr(intervals, "_integrate", lambda flow, *rest: seen.append(flow) or integrate(flow, *rest))
     assert sv.verify(cut).passed and len(seen) <= 4
+
+
+def test_a_stored_residual_that_is_not_that_of_the_motion_does_not_pass(gallery_model):
+    model, scene = gallery_model("overhead-crane"), gallery["overhead-crane"]
+    run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span, t_eval=np.linspace(0.0, 8.0, 41))
+    stored = {name: np.array(values) for name, values in run.residual.items()}
+    assert sv.verify(edited(run, stored_residual=stored)).passed
+    stored["X"][0, 10] = 0.5
+    assert "residual X" in sv.verify(edited(run, stored_residual=stored)).failures
