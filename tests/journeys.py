@@ -155,16 +155,16 @@ def counted(path):
 
 def main():
     wanted = sys.argv[1:] or ["J1", "J2", "J3", "J4", "J5"]
-    entered, rooms = travelled(wanted), {}
+    entered, parts = travelled(wanted), {}
     for path in sorted(PACKAGE.rglob("*.py")):
         statements = counted(path)
-        room = rooms.setdefault(path.relative_to(PACKAGE).parts[0], [0, 0])
-        room[0] += len(statements)
-        room[1] += len(statements & entered.get(path, set()))
-    for room, (all_, some) in sorted(rooms.items(), key=lambda item: -item[1][0]):
+        part = parts.setdefault(path.relative_to(PACKAGE).parts[0], [0, 0])
+        part[0] += len(statements)
+        part[1] += len(statements & entered.get(path, set()))
+    for part, (all_, some) in sorted(parts.items(), key=lambda item: -item[1][0]):
         if all_:
-            print(f"{room:20}{all_:7}{some:7}{100 * some / all_:6.1f} %")
-    all_, some = (sum(column) for column in zip(*rooms.values(), strict=True))
+            print(f"{part:20}{all_:7}{some:7}{100 * some / all_:6.1f} %")
+    all_, some = (sum(column) for column in zip(*parts.values(), strict=True))
     print(f"{'all':20}{all_:7}{some:7}{100 * some / all_:6.1f} %")
 
 

@@ -80,17 +80,17 @@ def test_links_and_named_files_exist(page):
         assert any((place / name).exists() for place in places), name
 
 
-def test_the_picture_of_the_rooms_is_drawn_from_the_sources(tmp_path):
-    drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "rooms.py"))
-    lines, imports = drawing["rooms"]()
+def test_the_picture_of_the_parts_is_drawn_from_the_sources(tmp_path):
+    drawing = runpy.run_path(str(ROOT / "docs" / "figures" / "parts.py"))
+    lines, imports = drawing["parts"]()
     assert imports["errors"] == set() and "spec" in imports["reduction"] and lines["spec"] > 500
     floor = drawing["heights"](imports)
     assert floor["errors"] == 0 < floor["spec"] < floor["reduction"] < floor["control"]
     assert all(below not in imports[other] for name, found in drawing["direct"](imports).items()
                for below in found for other in found - {below})  # fmt: skip
     drawing["draw"].__globals__["TRIES"] = 10
-    drawing["draw"](tmp_path / "rooms.png")
-    assert (tmp_path / "rooms.png").stat().st_size > 1000
+    drawing["draw"](tmp_path / "parts.png")
+    assert (tmp_path / "parts.png").stat().st_size > 1000
 
 
 def test_functions_named_in_the_table_of_equations_exist():

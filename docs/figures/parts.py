@@ -1,4 +1,4 @@
-"""Draw the rooms of the package and what each imports, from the sources: docs/figures/rooms.png."""
+"""Draw the parts of the package and what each imports, from the sources: docs/figures/parts.png."""
 
 import ast
 import sys
@@ -16,13 +16,13 @@ from servoctl import HOMES  # noqa: E402
 PACKAGE = Path(__file__).parents[2] / "servoctl"
 WIDTH, HEIGHT = 1.62, 0.5  # of a box; floors are 1 apart
 STEP, TRIES = 2.0, 6000  # distance of columns; moves of the search
-TOOLS = ("errors", "checks", "tolerances", "values", "archive", "progress", "version")  # of which any room may import
+TOOLS = ("errors", "checks", "tolerances", "values", "archive", "progress", "version")  # of which any part may import
 EDGE, FILL = "#4a6785", "#eef3f8"
 ARROW = {"arrowstyle": "-|>", "color": "#9db2c6", "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
 
 
-def rooms():
-    """Lines and imported rooms of every room: a folder or a file of the package."""
+def parts():
+    """Lines and imported parts of every part: a folder or a file of the package."""
     lines, imports = {}, {}
     for path in sorted(PACKAGE.rglob("*.py")):
         name = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
@@ -43,9 +43,9 @@ def rooms():
 
 
 def heights(imports):
-    """Longest path down to a room that imports nothing; a circle of imports is an error."""
+    """Longest path down to a part that imports nothing; a circle of imports is an error."""
     height = {}
-    for name in TopologicalSorter(imports).static_order():  # what a room imports comes before it
+    for name in TopologicalSorter(imports).static_order():  # what a part imports comes before it
         height[name] = max((1 + height[below] for below in imports[name]), default=0)
     return height
 
@@ -70,7 +70,7 @@ def hidden(start, end, boxes):
 
 
 def placed(floor, arrows):
-    """Room -> (x, y): a seeded search for columns with short arrows that run behind no box."""
+    """Part -> (x, y): a seeded search for columns with short arrows that run behind no box."""
     rng, names = np.random.default_rng(4), sorted(floor)
     column = {name: 0.0 for name in names}
     for row in {floor[n]: [m for m in names if floor[m] == floor[n]] for n in names}.values():
@@ -97,9 +97,9 @@ def placed(floor, arrows):
 
 
 def draw(path):
-    """Draw rooms by height above a row of tools; an arrow points at an imported room that no other arrow implies."""
-    lines, imports = rooms()
-    heights(imports)  # of all rooms, so that a circle through the tools is an error, too
+    """Draw parts by height above a row of tools; an arrow points at an imported part that no other arrow implies."""
+    lines, imports = parts()
+    heights(imports)  # of all parts, so that a circle through the tools is an error, too
     imports = {name: imported - set(TOOLS) for name, imported in imports.items() if name not in TOOLS}
     arrows = direct(imports)
     place = placed(heights(imports), arrows)
@@ -111,7 +111,7 @@ def draw(path):
         for below in imported:
             (x, y), (u, v) = place[name], place[below]
             ax.annotate("", (u, v + HEIGHT / 2), (x, y - HEIGHT / 2), zorder=1, arrowprops=ARROW)
-    ax.text(xs.min() - WIDTH / 2, -0.8, "tools, which any room may import", size=8, color="#556", va="center")
+    ax.text(xs.min() - WIDTH / 2, -0.8, "tools, which any part may import", size=8, color="#556", va="center")
     for name, (x, y) in (place | row).items():
         box = plt.Rectangle((x - WIDTH / 2, y - HEIGHT / 2), WIDTH, HEIGHT, fc=FILL, ec=EDGE, lw=1.2, zorder=2)
         ax.add_patch(box)
@@ -126,4 +126,4 @@ def draw(path):
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("rooms.png"))
+    draw(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("parts.png"))
