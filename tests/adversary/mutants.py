@@ -79,7 +79,7 @@ MUTANTS = {  # name: (file, old text, new text, tests)
         ("test_convergence.py", *MOTION[:1]),
     ),
     "RK4 with a wrong weight": (
-        "methods/runge_kutta.py", '"RK4": [1 / 6, 1 / 3, 1 / 3, 1 / 6]', '"RK4": [1 / 6, 1 / 3, 1 / 6, 1 / 3]', MOTION,
+        "methods/runge_kutta.py", "np.array([1, 2, 2, 1]) / 6", "np.array([1, 2, 1, 2]) / 6", MOTION,
     ),
     "the hold is half a period": (
         "control/sampling.py", "(B, period, out", "(B, period / 2, out", ("test_lqr.py", "test_sampling.py"),
