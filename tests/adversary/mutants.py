@@ -55,8 +55,8 @@ MUTANTS = {  # name: (file, old text, new text, tests)
         ("test_redundant_actuation.py",),
     ),
     "wishes with another sign": (
-        "reduction/realisation.py", "mechanism.balance - mechanism.E @ wished(",
-        "mechanism.balance + mechanism.E @ wished(", ("test_open_actuation.py",),
+        "reduction/realisation.py", "mechanism.balance - mechanism.E @ desired_actuation(",
+        "mechanism.balance + mechanism.E @ desired_actuation(", ("test_open_actuation.py",),
     ),
     "squares lose their middle term": (
         "jets/series.py", "inner = 0.0 if k % 2 else", "inner = 0.0 if k % 4 else",
