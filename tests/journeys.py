@@ -58,8 +58,9 @@ def blocks(page, language):
 
 
 def commands(page):
-    """What a page says after `servoctl`, in blocks and in indented lines."""
-    return re.findall(r"^(?: {4})?servoctl (.*)$", page.read_text(encoding="utf-8"), re.M)
+    """What a page says after `servoctl`, in blocks of commands and in indented lines."""
+    lines = "\n".join([*blocks(page, "sh"), *re.findall(r"^ {4}(.*)$", page.read_text(encoding="utf-8"), re.M)])
+    return re.findall(r"(?:^|&& )(?:\S*/)?servoctl (.*)$", lines, re.M)
 
 
 def run_blocks(page):
