@@ -37,6 +37,13 @@
 #define NEGLIGIBLE 1e-7
 #define FAR_OFF 30.0
 
+/* machine.c */
+#define WIDTH 64
+#define INPUT_ 1
+#define CONST_ 2
+#define OUTPUT_ 3
+#define OPERATIONS EACH(4, a + b) EACH(5, sqrt(a))
+
 /* batch.c */
 #define VECTORS 2
 #define LOOKED 64

@@ -19,8 +19,10 @@ from refusals import refused
 from servoctl.codegen import compiler, emit, native
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
-from servoctl.codegen.interpreted import BLOCK, Interpreter
+from servoctl.codegen.interpreted import MANY_POINTS, Interpreter
+from servoctl.codegen.machine import ENOUGH, TOGETHER, Machine
 from servoctl.errors import SpecificationError
+from servoctl.jets.branches import contains
 from servoctl.methods.runge_kutta import tableau
 from servoctl.values import same
 
@@ -116,19 +118,56 @@ def test_every_operation_equals_casadi(monkeypatch, c_compiler):
             np.testing.assert_array_max_ulp(row, expected, maxulp=2)
 
 
-@pytest.mark.parametrize("n", [BLOCK // 4, BLOCK, 2 * BLOCK + 3, 2 * BLOCK + 3 * BLOCK // 4])
-def test_many_points_at_once_have_the_bits_of_single_points(n):
-    expressions, _ = every_operation()
-    rng = np.random.default_rng(8)
-    t, x = rng.normal(size=n), rng.normal(size=(2, n))
-    for f in function(*expressions), random_function(900):
-        evaluator = Interpreter(f)
-        for p in np.array([1.5]), rng.normal(size=(1, n)):
-            once, again = np.empty((2, f.numel_out(0), n))
-            for k in range(n):
-                once[:, k] = evaluator._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
+@pytest.mark.parametrize("with_compiler", [True, False])
+def test_operations_on_many_points_at_once_have_the_bits_of_single_points(with_compiler, monkeypatch, c_compiler):
+    if not with_compiler:
+        monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    expressions, x = every_operation()
+    f, (a, b) = function(*expressions), X2.elements()
+    guarded = function(ca.if_else(a > 0, b, 3.0), ca.copysign(2.0, 2.0) * a, a - a, 0.0, -0.0, T, x=X2)
+    rng, n = np.random.default_rng(8), x.shape[1]
+    every = f, function(*without_erfinv(expressions)), guarded, random_function(900)
+    for g, p in itertools.product(every, (np.array([1.5]), rng.normal(size=(1, n)))):
+        once, again, t = np.empty((g.numel_out(0), n)), np.empty((g.numel_out(0), n)), rng.normal(size=n)
+        evaluator = Interpreter(g)
+        for k in range(n):
+            once[:, k] = evaluator._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
+        while "_machine" not in vars(evaluator):
             evaluator.grid(t, x, p, again)
-            np.testing.assert_array_equal(again, once)
+        again[:] = np.inf
+        evaluator.grid(t, x, p, again)
+        by_operations = with_compiler and not contains(g, ca.OP_ERFINV)
+        assert isinstance(evaluator._machine, Machine) == by_operations
+        np.testing.assert_array_equal(again, once)
+        zeros = once == 0
+        np.testing.assert_array_equal(np.signbit(again[zeros]), np.signbit(once[zeros]))
+
+
+def test_a_function_is_written_for_many_points_at_once_when_many_were_evaluated():
+    evaluator, y = Interpreter(random_function(50)), np.empty((21, MANY_POINTS // 2))
+    t, x, p = np.zeros(y.shape[1]), np.zeros((2, y.shape[1])), np.zeros(1)
+    made = []
+    for _ in range(3):
+        evaluator.grid(t, x, p, y)
+        made.append("_machine" in vars(evaluator))
+    assert made == [False, True, True]
+
+
+@pytest.mark.parametrize("n", [1, ENOUGH - 1, ENOUGH, TOGETHER - 1, TOGETHER, TOGETHER + 1, 3 * TOGETHER + ENOUGH])
+def test_a_list_of_operations_fills_what_it_is_given_and_no_more(n, c_compiler, monkeypatch):
+    calls, run = [], Machine.grid
+    monkeypatch.setattr(Machine, "grid", lambda self, t, *rest: (calls.append(t.size), run(self, t, *rest)))
+    g, rng = random_function(60), np.random.default_rng(n)
+    evaluator = Interpreter(g)
+    evaluator.grid(np.zeros(MANY_POINTS), np.zeros((2, MANY_POINTS)), np.zeros(1), np.empty((21, MANY_POINTS)))
+    t, x = rng.normal(size=n), rng.normal(size=(n, 2)).T  # the numbers of a point next to each other
+    around = np.full((n + 2, 23), np.pi)
+    evaluator.grid(t, x, np.array([0.3]), around[1:-1, 1:-1].T)
+    once = np.array([evaluator._value(t[k], x[:, k].copy(), np.array([0.3])) for k in range(n)])
+    np.testing.assert_array_equal(around[1:-1, 1:-1], once)
+    around[1:-1, 1:-1] = np.pi
+    assert np.all(around == np.pi)
+    assert calls == [MANY_POINTS] + [n] * (n >= ENOUGH)
 
 
 def test_constants_are_exact(monkeypatch, c_compiler):

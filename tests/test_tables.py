@@ -17,6 +17,7 @@ import servoctl as sv
 from servoctl.codegen import compiler, emit
 from servoctl.codegen import function as functions
 from servoctl.codegen.function import compiled
+from servoctl.codegen.interpreted import MANY_POINTS, Interpreter
 from servoctl.export import c as export
 from servoctl.jets import lookup
 from servoctl.jets.pieces import by_pieces
@@ -87,6 +88,22 @@ def test_lookups_equal_the_sums_to_the_last_bit_one_by_one_and_in_lanes(uncontra
     np.testing.assert_array_equal(alone, expected)
     np.testing.assert_array_equal(model.grid(t, x, [1.5]), expected)
     assert ("table_" in model.source()) == (name not in ("points of parameters", "a switch"))
+
+
+@pytest.mark.parametrize("name", [*PATHS, "a table of data"])
+def test_many_points_that_casadi_evaluates_at_once_have_the_bits_of_single_points(name):
+    times = np.linspace(0.0, 6.0, 300)
+    build, knots = PATHS.get(name, (lambda: sv.paths.spline(T, times, points(times)), times))
+    f = ca.Function("f", [T, X, P], [ca.densify(build())])
+    t, evaluator = instants(knots), Interpreter(f)
+    x, p = RNG.uniform(0.0, 6.0, (2, len(t))), np.array([1.7])
+    once = np.array([evaluator._value(*at, p) for at in zip(t, x.T, strict=True)]).T
+    again = np.empty_like(once)
+    for _ in range(1 + MANY_POINTS // len(t)):
+        evaluator.grid(t, x, p, again)
+    np.testing.assert_array_equal(again, once)
+    assert bool(lookup.lookups(f)) == (name == "a table of data")
+    assert evaluator._machine is None or not lookup.lookups(f)
 
 
 def test_what_a_point_costs_does_not_depend_on_the_number_of_via_points():

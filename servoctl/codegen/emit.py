@@ -51,6 +51,7 @@ _ELEMENTARY |= {getattr(ca, f"OP_{name.upper()}"): (name, 2) for name in _BINARY
 _COPIES = {ca.OP_ASSIGN, ca.OP_LIFT}  # the first operand, unchanged
 _NOT_ARITHMETIC = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *_COPIES}
 EMITTED = frozenset({*_ARITHMETIC, *_ELEMENTARY, *_NOT_ARITHMETIC, ca.OP_CALL})  # what has a C counterpart
+SAME_BITS = EMITTED - {ca.OP_CALL, ca.OP_ERFINV}  # what C evaluates as CasADi does, point by point
 
 _FORMS_OF_ONE = {
     "sign": "({0} < 0 ? -1 : {0} > 0 ? 1 : {0})",
@@ -212,6 +213,18 @@ def emit_builtin(f, name):
     """C translation unit of the builtin function of Python ``name``, with the operations of CasADi, one by one."""
     constants = {"NAME": name, "NX": f.numel_in(1), "NP": f.numel_in(2), "NY": f.numel_out(0)}
     return "".join((unit(constants), function(f, name, EXACT), include("builtin.c")))
+
+
+def emit_machine(width):
+    """C translation unit of ``servoctl_machine``, which carries out lists of operations at `width` points at once."""
+    moved = {"INPUT_": ca.OP_INPUT, "CONST_": ca.OP_CONST, "OUTPUT_": ca.OP_OUTPUT}
+    copied = {operation: ca.OP_ASSIGN for operation in _COPIES}
+    cases = (
+        f"EACH({operation}, {EXACT.expression(copied.get(operation, operation), ('a', 'b'))})"
+        for operation in sorted(SAME_BITS - {*moved.values()})
+    )
+    constants = {"NAME": "servoctl", "NX": 0, "NP": 0, "NY": 0, "WIDTH": width, **moved, "OPERATIONS": " ".join(cases)}
+    return unit(constants) + include("machine.c")
 
 
 def unit(constants):

@@ -21,8 +21,10 @@ from servoctl.codegen.loops import (
     SHORTEST,
     STEADY,
 )
+from servoctl.codegen.machine import ENOUGH, machine
 
 BLOCK = 128  # instants of a path that are solved together
+MANY_POINTS = 2_000  # of them CasADi takes longer, one by one, than writing the list of operations takes
 
 _guard = threading.Lock()
 
@@ -102,7 +104,7 @@ class Interpreter:
 
     def __init__(self, f, project=None, sizes=None, settled=None):
         self._f, self._n_x, self._project, self._sizes, self._settled = f, f.numel_in(1), project, sizes, settled
-        self._parts = 1, self._n_x, f.numel_in(2), f.numel_out(0)
+        self._parts, self._points = (1, self._n_x, f.numel_in(2), f.numel_out(0)), 0
         self.workspace = Workspace(*self._parts[1:], self._connect)
 
     def _connect(self, row, parts):
@@ -119,6 +121,10 @@ class Interpreter:
 
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
+        self._points += t.size
+        if self._points >= MANY_POINTS and t.size >= ENOUGH and self._machine is not None:
+            self._machine.grid(t, x, p, y)
+            return
         left = t.size % BLOCK
         blocks = t.size - left * (left < BLOCK // 2)  # a block with half as many points is faster than these one by one
         if t.size < BLOCK and "_blocks" not in vars(self):  # making them takes longer; same bits
@@ -139,6 +145,11 @@ class Interpreter:
     @functools.cached_property
     def _blocks(self):
         return Blocks(self._block, self._parts)
+
+    @functools.cached_property
+    def _machine(self):
+        """Evaluation of many points in C; None where it cannot."""
+        return machine(self._f, self._points // BLOCK)
 
     @functools.cached_property
     def _block(self):
