@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from conftest import numbers
 from refusals import refused
+from scipy.linalg import qr
 
 from servoctl.errors import SingularProgram
 from servoctl.reduction import ranks
 from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate, pivot_order
+from servoctl.reduction.realisation import _independent_columns
 from servoctl.tolerances import EXTENDED, NOISE
 
 LONG = np.longdouble
@@ -212,6 +214,14 @@ def test_identities_are_decided_where_values_cannot_tell(monkeypatch):
     assert tests == [1, 1]  # nothing is left of it
     solved(ca.vertcat(ca.horzcat(a, a * b, c), ca.horzcat(c, b * c + late, d), ca.horzcat(d, b, a)))
     assert tests[2] == 1 and len(tests) <= 4  # a difference that arises on the way, then those that follow
+
+
+def test_columns_of_a_plan_are_those_of_a_pivoted_qr():
+    rng = np.random.default_rng(7)
+    for _ in range(300):
+        m = int(rng.integers(1, 7))
+        matrix = rng.normal(size=(m, m + int(rng.integers(0, 6)))) * 10.0 ** rng.integers(-5, 6)
+        assert _independent_columns(matrix, m) == qr(matrix, mode="r", pivoting=True)[1][:m].tolist()
 
 
 def test_a_small_pivot_is_not_taken_for_its_fill_in():
