@@ -122,7 +122,10 @@ def without_effect(options, where):
     """Refuse the names of options that are given where they do nothing: `where` ends the sentence, "for a Law"."""
     if options:
         raise SpecificationError(
-            f"{', '.join(options)} was given {where}.", "It would have no effect.", do="Leave it out.", options=options
+            f"{', '.join(options)} {'was' if len(options) == 1 else 'were'} given {where}.",
+            "This would have no effect.",
+            do="Leave it out.",
+            options=options,
         )
 
 
@@ -292,8 +295,13 @@ def finite(name, value, what="value"):
     """A finite float from a number; `what` it is, in the singular: "limit", "noise"."""
     number = _as_float(value)
     if not math.isfinite(number):
-        given, rule = f"The {what} {name!r} is {value!r}.", f"A {what} must be a finite number."
-        raise SpecificationError(given, rule, name=name, type=type(value).__name__)
+        a = "An" if what[0] in "aeiou" else "A"
+        raise SpecificationError(
+            f"The {what} {name!r} is {value!r}.",
+            f"{a} {what} must be a finite number.",
+            name=name,
+            type=type(value).__name__,
+        )
     return number
 
 
@@ -372,9 +380,9 @@ def whole_of(name, value, valid):
     if not (is_whole(value) and value in valid):
         span = f"from {valid[0]} to {valid[-1]}" if isinstance(valid, range) else f"out of {', '.join(map(str, valid))}"
         raise SpecificationError(
-            f"{name}={value!r} was given.",
+            f"{name}={repr(value)[:150]} was given.",
             f"It is a whole number {span}.",
-            nearest=f"{name}={min(valid, key=lambda number: abs(number - value))}." if is_number(value) else "",
+            nearest=f"{name}={min(valid, key=lambda n: (abs(n - value), -n))}." if is_number(value) else "",
             **{name: value},
         )
     return int(value)

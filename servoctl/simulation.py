@@ -221,10 +221,9 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     method, drift = _method_and_drift(model, method, drift, t0, t1)
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, Poles)
     x0 = as_state(model, start, t0) if leads_back else consistent_state(model, start, t0, isinstance(drift, Project))
-    forward = min(span), max(span)
-    knots = knots_within(model, forward)
+    knots = knots_within(model, span)
     if not isinstance(method, Algebraic):
-        ends = model.reduction.switches.ends_of_pieces(model.parameters, forward)
+        ends = model.reduction.switches.ends_of_pieces(model.parameters, (min(span), max(span)))
         knots = tuple(sorted({*knots, *ends.tolist()}))
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)

@@ -112,7 +112,7 @@ def same(a, b):
 
 def evenly(n, most):
     """Indices (k,) of at most so many of n entries, evenly spread from the first to the last."""
-    return np.unique(np.linspace(0, n - 1, most).round().astype(int))
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
 
 
 def read_only(array):

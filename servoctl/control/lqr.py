@@ -18,7 +18,7 @@ from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.plants.plant import Plant
 from servoctl.run import Run
-from servoctl.values import Deferred
+from servoctl.values import Deferred, evenly
 
 MARGINAL = 1 + 1e-6  # spectral radius up to which a mode that no input reaches neither decays nor grows
 DECAYS = 1e-9  # how far below 1 the spectral radius under a steady gain is: nearer it is a neutral mode's rounding
@@ -189,7 +189,7 @@ def steady(A, B, Q, R, T):
 def _explained(error, augmented, basis, names, plant, varying):
     """The error of a Riccati equation without a solution, with the mode that inputs do not reach or weights not see."""
     A, B, Q = augmented
-    some = np.unique(np.linspace(0, len(A) - 1, COMPARED).round().astype(int))
+    some = evenly(len(A), COMPARED)
     T = basis[-1]
     a = T.T @ A[-1] @ T
     unreached, unseen = _conserved(A[some], B[some], basis[some]), _fixed_modes(a.T, Q @ T)

@@ -19,7 +19,7 @@ from servoctl.run import Run, require_run
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.units import rate_unit
-from servoctl.values import frozen
+from servoctl.values import evenly, frozen
 
 
 @frozen
@@ -329,7 +329,7 @@ def _ranks(model, structure, run, ends):
         return None, places
     n_x = len(model.state_names)
     some = np.flatnonzero(np.isfinite(run.jets[:n_x]).all(axis=0))
-    some = some[np.unique(np.linspace(0, len(some) - 1, SAMPLED).round().astype(int))]
+    some = some[evenly(len(some), SAMPLED)]
     along = np.concatenate([_margins(run, some, part) for part in run.variants or ((0, len(run.t), model),)])
     if np.isnan(along).all():
         return None, places

@@ -135,7 +135,7 @@ def plan_many(model, span, cases, times, threads=None, progress=None):
         return None, None, False
     x0, p = cases
     n, n_x = x0.shape
-    cuts = breakpoints(span, knots_within(model, (min(span), max(span))))
+    cuts = breakpoints(span, knots_within(model, span))
     arrays = {"x0": x0, "p": p, "pivots": pivot_sizes(model), "times": times, "cuts": cuts}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= _results(n, len(times), n_x)

@@ -104,12 +104,12 @@ def default_start(model: "Model", t: float = 0.0) -> State:
 
 
 def knots_within(model: "Model", span: tuple) -> tuple:
-    """Knots of the paths within a time span; SpecificationError if a path is not smooth enough there.
+    """Knots of the paths within a span, in either direction; SpecificationError if a path is not smooth enough there.
 
     Of a spline of many pieces they are those between the first and the last that are inspected; the others, at which
     series end, are `Switches.ends_of_pieces`.
     """
-    r = model.reduction
+    r, span = model.reduction, (min(span), max(span))
     if r.timed and span not in model._knots_within:
 
         def build():

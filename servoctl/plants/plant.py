@@ -130,15 +130,12 @@ def part_of(whole, mechanism):
 
 def made_again(whole, mechanism, **of_actuators):
     """The plant of a mechanism with the forces, damping and parameters of a whole one."""
-    names, forces = (
-        mechanism.q.force_names,
-        dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True)),
-    )
+    forces = dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True))
     return _made(
         mechanism,
         dict(zip(mechanism.parameters.names, whole.parameters.tolist(), strict=False)),
-        {name: forces[name] for name in names if not forces[name].is_zero()},
-        {name: c for name, c in whole.damping.items() if name in names},
+        {name: forces[name] for name in mechanism.q.force_names if not forces[name].is_zero()},
+        {name: c for name, c in whole.damping.items() if name in mechanism.q.force_names},
         **of_actuators,
     )
 

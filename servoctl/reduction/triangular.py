@@ -116,10 +116,10 @@ def _with_uses(q, rows, cascade, points):
         open_ = [a for a in block.places if k or a not in known]
         while open_:
             derivations = {a: _derivation(q, pairs[a], rows[a], known, points) for a in open_}
-            told_now = {a for a in open_ if derivations[a]} or set(open_)
-            pairs |= {a: replace(pairs[a], derivation=derivations[a] or pairs[a].derivation) for a in told_now if k}
-            known |= {a: pairs[a] for a in told_now}
-            open_ = [a for a in open_ if a not in told_now]
+            now = {a for a in open_ if derivations[a]} or set(open_)
+            pairs |= {a: replace(pairs[a], derivation=derivations[a] or pairs[a].derivation) for a in now if k}
+            known |= {a: pairs[a] for a in now}
+            open_ = [a for a in open_ if a not in now]
         blocks.append(replace(block, rows=tuple(pairs.values())))
     return replace(cascade, blocks=tuple(blocks))
 

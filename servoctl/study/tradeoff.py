@@ -28,6 +28,7 @@ from servoctl.simulation import as_state, simulated
 from servoctl.study.converged import Comparison, Converged, Deadline
 from servoctl.study.executor import whole_run
 from servoctl.study.table import SHOWN, Study, machine, table
+from servoctl.values import evenly
 
 MEASURED = tuple(name for name in METHODS if name != "bounded")  # which solves another problem
 OF_MODELS = ("Taylor", "RadauIIA")  # default methods where models are compared: the second for stiff ones
@@ -195,7 +196,7 @@ class TradeOff(Study):
         t0, t1 = self.meta["t_span"]
         reference, where = self.meta["reference"], self.meta["machine"]
         front = self.pareto()
-        shown = np.unique(np.linspace(0, len(front) - 1, min(SHOWN, len(front))).round().astype(int))
+        shown = evenly(len(front), SHOWN)
         lines = [
             f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers; t = {t0:g} .. {t1:g} s"
             + ("; interrupted" if self.meta.get("message") else ""),

@@ -16,7 +16,7 @@ from servoctl.model.switching import switching
 from servoctl.model.variants import derived_near, place_of, variant_at
 from servoctl.progress import stage
 from servoctl.run import SAME_TIME, Run, on_side, require_run, sides
-from servoctl.values import frozen
+from servoctl.values import evenly, frozen
 from servoctl.verification.between import Edges, Flow, between
 from servoctl.verification.loop import verify_loop
 from servoctl.verification.remarks import of_loop, of_run
@@ -126,7 +126,10 @@ def _required(run):
     backwards = count > 1 and t[count - 1] < t[0]
     faulty = int(np.sum(~good[:count]) + np.sum((steps >= 0) if backwards else (steps <= 0)))
     parts = {"variants": _variants(model, run, count), "knots": tuple(knots)}
-    parts["stored"] = {name: np.asarray(values)[:count] for name, values in run.stored.items() if np.ndim(values)}
+    parts |= {
+        what: {name: np.asarray(values)[..., :count] for name, values in kept.items() if np.ndim(values)}
+        for what, kept in zip(("stored", "stored_residual"), mappings, strict=True)
+    }
     return replace(run, t=t[:count], jets=jets[:, :count], jet_names=jet_names_to(model, len(jets)), **parts), faulty
 
 
@@ -152,7 +155,7 @@ class _Instants:
     @property
     def few(self):
         """Indices of the instants at which sizes are measured."""
-        return np.unique(np.linspace(0, len(self.t) - 1, FEW_SIZES).round().astype(int))
+        return evenly(len(self.t), FEW_SIZES)
 
     def signals(self, kind):
         f = self.model.signals(kind)[1]
