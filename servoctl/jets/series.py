@@ -15,7 +15,8 @@ from math import factorial, prod
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.tape import REAL, Scalars, add, apply, divide, finite, holds, multiply, select, subtract
+from servoctl.errors import SpecificationError
+from servoctl.jets.tape import JETS, REAL, Scalars, add, apply, divide, finite, holds, multiply, select, subtract
 
 _NUMBERS = (float, int)
 OVERFLOWING = 1e100  # a divisor beyond it, of which a coefficient has overflown, is infinite
@@ -234,7 +235,8 @@ class _Grouped(Series):
 class Motion:
     """The normalised Taylor coefficients of every symbol along a motion.
 
-    Subclasses define `coordinate(i, j)`, coefficient j of q_i, and `velocity(i, l, j)`, coefficient j of γ_i^(l).
+    Subclasses define `coordinate(i, j)`, coefficient j of q_i, and `velocity(i, l, j)` and `reference(i, l, j)`, those
+    of γ_i^(l) and r_i^(l).
     """
 
     def __init__(self, q):
@@ -247,6 +249,17 @@ class Motion:
             return self.coordinate(i, j)
         if kind == "w":
             return self.velocity(i, level, j)
+        if kind == "r" and level + j <= JETS:
+            return self.reference(i, level, j)
+        if kind == "r":
+            raise SpecificationError(
+                f"The derivative {level + j} of the reference {self.q.family.names[i]} was asked for.",
+                f"Derivatives of references end at order {JETS}.",
+                do="Let the program follow it in rows of lower order.",
+                name=self.q.family.names[i],
+                order=level + j,
+                limit=JETS,
+            )
         return symbol if j == 0 else float(kind == "t" and j == 1)
 
 
@@ -292,6 +305,23 @@ class Flow:
         if "lowest" not in self._cache:
             self._cache["lowest"] = Flow(self.q, self.rows, 0, self.points, self.signals, self.real)
         return self._cache["lowest"].at(self.points)
+
+    def aim(self, t, z):
+        """Residuals of rows of order 0 and slopes (rows, nq + references, N) in q and r; None without a reference."""
+        if "aim" not in self._cache:
+            rows = ca.vertcat(*(row.expression for row in self.rows if row.order == 0))
+            targets = ca.vertcat(ca.SX(0, 1), *(self.q.family.jet(name, 0) for name in self.q.family.names))
+            slopes = ca.jacobian(rows, ca.vertcat(self.q.jet(0), targets))
+            places = np.array(slopes.sparsity().get_triplet(), dtype=int)
+            aims = ca.depends_on(rows, targets) if len(self.q.family) else False
+            self._cache["aim"] = aims and (self._scalars([*rows.elements(), *slopes.nonzeros()]), slopes.shape, places)
+        if not self._cache["aim"]:
+            return None
+        scalars, shape, (rows, columns) = self._cache["aim"]
+        values = scalars.values(t, z, self.points.values)
+        slopes = np.zeros((*shape, z.shape[1]))
+        slopes[rows, columns] = values[shape[0] :]
+        return values[: shape[0]], slopes
 
     def _scalars(self, expressions):
         return Scalars(self.q, self.points.parameters, expressions, self.signals)
@@ -433,7 +463,7 @@ class Flow:
 
     def _run(self, scalars, t, z, q_series, depth, first=None):
         """Coefficients 0 .. depth of the first scalars, (first, depth + 1, N)."""
-        motion, values = _Numbers(self.q, z, q_series, self.level), scalars.inputs(t, z, self.points.values)
+        motion, values = _Numbers(self.q, t, z, q_series, self.level), scalars.inputs(t, z, self.points.values)
         inputs = []
         for symbol, value in zip(scalars.tape.symbols, values, strict=True):
             higher = (motion.coefficient(symbol, k) for k in range(1, depth + 1))
@@ -446,11 +476,11 @@ class Flow:
 
 
 class _Numbers(Motion):
-    """The motion of jets z (nz, N); those above a level are zero."""
+    """The motion of jets z (nz, N) at instants t; those above a level are zero."""
 
-    def __init__(self, q, z, q_series, level):
+    def __init__(self, q, t, z, q_series, level):
         super().__init__(q)
-        self.z, self.q_series, self.level = z, q_series, level
+        self.t, self.z, self.q_series, self.level = t, z, q_series, level
 
     def coordinate(self, i, j):
         return self.q_series[j][i]
@@ -459,3 +489,6 @@ class _Numbers(Motion):
         if level + j > self.level:
             return np.zeros(self.z.shape[1], dtype=REAL)
         return shifted(self.z[self.q.nq + (level + j - 1) * self.q.n + i], level, j)
+
+    def reference(self, i, level, j):
+        return shifted(self.t[:, 1 + i * (JETS + 1) + level + j], level, j)

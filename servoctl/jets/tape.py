@@ -19,6 +19,7 @@ from servoctl.jets.lookup import Lookup, lookup_at
 from servoctl.tolerances import LAST_EXPONENT
 
 REAL = np.longdouble
+JETS = 40  # highest derivative of a reference that rows may contain: chains of a dozen cars and springs need 30
 MOST_SQUARED = 64  # the largest whole exponent that is written as squares and products
 
 # Mode 0 is the default of CasADi 3.8: NumPy's functions of symbols work, each with a warning. Mode -1 gives no warning.
@@ -520,7 +521,8 @@ class Scalars:
     """SX scalars on one tape, with the places of their symbols in jet space.
 
     `places` says what each symbol is; see `Coordinates.where`. `others` are element hashes of symbols outside jet
-    space, besides the parameters, which are evaluated as zero.
+    space, besides the parameters, which are evaluated as zero. An instant is a row of numbers: the time, then the
+    Taylor coefficients 0 .. JETS of each reference.
     """
 
     def __init__(self, q, parameters, expressions, others=()):
@@ -528,7 +530,9 @@ class Scalars:
         self._last = None, None  # inputs, and the values of all nodes
         self.places = [q.where(s) for s in self.tape.symbols]
         names = [p.element_hash() for p in parameters]
-        first = {"t": 1 + len(names), "q": 2 + len(names)}
+        self._top = 1 + max([-1, *(place[2] for place in self.places if place and place[0] == "r")])  # references used
+        instant = 1 + len(names)
+        first = {"t": instant, "q": instant + 1 + self._top * (JETS + 1)}
         self._rows, self._factors = [], np.ones((len(self.places), 1))
         for i, (symbol, place) in enumerate(zip(self.tape.symbols, self.places, strict=True)):
             if place is None:
@@ -536,15 +540,18 @@ class Scalars:
                 self._rows.append(0 if key in others else 1 + names.index(key))
             else:
                 kind, level, k = place
-                start = first["q"] + q.nq + (level - 1) * q.n if kind == "w" else first[kind]
-                self._rows.append(start + k)
+                if kind == "r":
+                    row = instant + 1 + k * (JETS + 1) + level
+                else:
+                    row = k + (first["q"] + q.nq + (level - 1) * q.n if kind == "w" else first[kind])
+                self._rows.append(row)
                 self._factors[i] = factorial(level)
 
     def inputs(self, t, z, values):
-        """Values of the symbols (n, N) at times t (N,) and jets z (nz, N). Jets of a higher level than z are zero."""
-        sources = np.empty((2 + len(values) + len(z), len(t)), dtype=REAL)
-        sources[0], sources[1 : 1 + len(values)] = 0.0, values[:, None]
-        sources[1 + len(values)], sources[2 + len(values) :] = t, z
+        """Values of the symbols (n, N) at instants t (N, 1 + R) and jets z (nz, N); jets of a higher level are zero."""
+        known = 1 + self._top * (JETS + 1)
+        constants = np.broadcast_to(np.append(0.0, values)[:, None], (1 + len(values), len(t)))
+        sources = np.vstack([constants, np.reshape(t, (len(t), -1))[:, :known].T, z]).astype(REAL)
         return sources[[row if row < len(sources) else 0 for row in self._rows]] * self._factors
 
     def values(self, t, z, values):

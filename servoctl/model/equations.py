@@ -317,7 +317,7 @@ class Equations(Invariants):
             names, kind = [jet_name(name, rate) for name in names], f"{kind}_rate{rate}"
         values = ca.vertcat(ca.SX(0, 1), *expressions)  # SX without expressions, too
         places = filter(None, map(self.q.where, ca.symvar(values)))
-        highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        highest = max((level for of, level, _ in places if of == "w"), default=0)
         above = (s for k in range(self.top + 1, highest + 1) for s in self.q.gamma(k))
         return names, self.function(kind, ca.vertcat(self.jets, *above), [values])
 
@@ -405,7 +405,7 @@ class Equations(Invariants):
         A row of the program that hidden rows replace may have an order above s̄.
         """
         places = filter(None, map(self.q.where, ca.symvar(expression)))
-        highest = max((level for of, level, _ in places if of not in ("t", "q")), default=0)
+        highest = max((level for of, level, _ in places if of == "w"), default=0)
         if self.cascade is not None and highest > self.top:
             motion, above = self.cascade.along(self.points, self.top, highest), range(self.top + 1, highest + 1)
             jets = [ca.vertcat(*(e for k in above for e in part(k).elements())) for part in (self.q.jet, motion.jet)]
@@ -516,5 +516,5 @@ def gradient_jets(reduction, name):
     for row in (*reduction.rows, *reduction.original.values()):
         if row.name == name:
             places = [q.where(s) for s in ca.symvar(row.gradient(q))]
-            return [q.jet_names(level)[i] for kind, level, i in filter(None, places) if kind != "t"]
+            return [q.jet_names(level)[i] for kind, level, i in filter(None, places) if kind in "qw"]
     return []

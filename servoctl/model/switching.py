@@ -26,7 +26,7 @@ class Switching:
         r, q = model.reduction, model.reduction.mechanism.q
         self.model = model
         names = r.mechanism.parameters.names
-        branches = Branches(lambda s: (q.where(s) or ("t",))[0] != "t", names)
+        branches = Branches(q.is_jet, names)
         self._specification = _smooth(r.mechanism, r.program, _angles(model), branches)
         self.switches = branches.switches
         for s in self.switches:

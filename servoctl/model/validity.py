@@ -49,7 +49,7 @@ def quantities(equations):
     scalars = [ca.SX(e) for group in groups.values() for e in group]
     counts = {name: len(group) for name, group in groups.items()}
     places = filter(None, map(r.mechanism.q.where, ca.symvar(ca.vertcat(*scalars))))
-    if any(level > r.top for of, level, _ in places if of not in ("t", "q")):
+    if any(level > r.top for of, level, _ in places if of == "w"):
         return Quantities(None, counts, np.zeros(0))
     sized = len(scalars) - counts["mass"]
     sizes = [*sizes_of_terms(scalars[:sized]), ca.SX(counts["mass"], 1)]

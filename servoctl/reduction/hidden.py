@@ -317,7 +317,7 @@ def _no_common_state(q, rows, context):
 def _no_state(q, rows, context):
     """The error of rows without a common state; it tells of one that is far from where random points move it."""
     points = sample(q, [], max(0, *(row.order for row in rows)), context)
-    points = replace(points, t=np.full_like(points.t, points.t[0]))  # a path alone brings no residual to zero
+    points = replace(points, instants=points.instants[[0] * len(points)])  # a path alone brings no residual to zero
     values = np.abs(points.evaluate([row.expression for row in rows])[0]).astype(float)
     with np.errstate(all="ignore"):
         ratios = np.nan_to_num(values.min(axis=1) / np.ptp(values, axis=1), posinf=0.0)

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.jets.series import Flow
-from servoctl.jets.tape import REAL, Book
+from servoctl.jets.tape import JETS, REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
 from servoctl.tolerances import CUTOFF
 from servoctl.values import frozen
@@ -25,6 +25,7 @@ ON_MANIFOLD = 1e-13  # largest scaled residual of a point: far below ENTRY, so t
 GAUSS_NEWTON_STEPS = 60  # on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
 LEVEL_SWEEPS = 2  # a second one, without gradients in all jets, where the first leaves the rounding of its steps
+AIMING_STEPS = 6  # Gauss-Newton steps of q and references together, before the levels
 SHORTENINGS = 12  # quarterings of a step before the search from a start ends
 SPREAD = 0.1  # relative width of starts about a guess, whose size is its value plus its usual size
 POINTS = 5  # at which ranks are decided; with as many further starts where one of the first fails
@@ -36,7 +37,7 @@ class Points:
     """Points in jet space."""
 
     q: object
-    t: np.ndarray  # (N,) [s]
+    instants: np.ndarray  # (N, 1 + R): the time [s], and r^(k)/k! there, k = 0..JETS, of each reference
     z: np.ndarray  # (nq + K n, N): q and the normalised Taylor coefficients γ_[k] = γ^(k)/k!, k = 1..K
     parameters: tuple  # SX
     values: np.ndarray  # (n_p,), of the parameters
@@ -46,7 +47,15 @@ class Points:
     _values: dict = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self):
-        return f"Points({len(self.t)} points, jets up to order {self.level})"
+        return f"Points({len(self)} points, jets up to order {self.level})"
+
+    def __len__(self):
+        return len(self.instants)
+
+    @property
+    def t(self):
+        """The times (N,) [s]."""
+        return self.instants[:, 0]
 
     @property
     def level(self):
@@ -63,15 +72,15 @@ class Points:
         if k == 0:
             return self.z[:nq]
         if k > self.level:
-            return np.zeros((n, len(self.t)), dtype=self.z.dtype)
+            return np.zeros((n, len(self)), dtype=self.z.dtype)
         return self.z[nq + (k - 1) * n : nq + k * n] * factorial(k)
 
     def evaluate(self, expressions):
         """Values and sizes of SX scalars at the points: two arrays (len, N)."""
-        result = np.empty((2, len(expressions), len(self.t)), dtype=REAL)
+        result = np.empty((2, len(expressions), len(self)), dtype=REAL)
         for scalars, sources, targets in self.book.find(self.q, self.parameters, expressions):
             if scalars not in self._values:
-                self._values[scalars] = scalars.evaluate(self.t, self.z, self.values)
+                self._values[scalars] = scalars.evaluate(self.instants, self.z, self.values)
             result[:, targets] = self._values[scalars][:, sources]
         return result[0], result[1]
 
@@ -87,30 +96,36 @@ class Points:
     def placed(self, sparsity, *nonzeros):
         """Arrays (rows, columns, N) from their nonzero entries (nnz, N)."""
         rows, columns = sparsity.get_triplet()
-        matrices = np.zeros((len(nonzeros), *sparsity.shape, len(self.t)), dtype=REAL)
+        matrices = np.zeros((len(nonzeros), *sparsity.shape, len(self)), dtype=REAL)
         matrices[:, rows, columns] = nonzeros
         return tuple(matrices)
 
     def joined(self, other):
         """These points and others of the same jets."""
         residual = np.append(self.residual, other.residual)
-        return replace(self, t=np.append(self.t, other.t), z=np.hstack([self.z, other.z]), residual=residual)
+        instants, z = np.vstack([self.instants, other.instants]), np.hstack([self.z, other.z])
+        return replace(self, instants=instants, z=z, residual=residual)
 
     def factorials(self, level):
         """The derivatives of jets up to a level relative to their normalised Taylor coefficients, (nq + level n,)."""
         return np.repeat([1.0, *(factorial(k) for k in range(1, level + 1))], [self.q.nq, *level * [self.q.n]])
 
     def at(self, t, jets, values):
-        """Other points: at times t (N,), jets (nq + K n, N) and parameters (n_p,)."""
+        """Other points: at times t (N,), or instants, jets (nq + K n, N) and parameters (n_p,)."""
         level = (len(jets) - self.q.nq) // self.q.n
         z = jets / self.factorials(level)[:, None].astype(REAL)
-        return replace(self, t=np.asarray(t), z=z, values=values, residual=np.zeros(len(t)))
+        return replace(self, instants=as_instants(t), z=z, values=values, residual=np.zeros(len(t)))
 
     def take(self, keep):
         """Some of the points."""
-        some = replace(self, t=self.t[keep], z=self.z[:, keep], residual=self.residual[keep])
+        some = replace(self, instants=self.instants[keep], z=self.z[:, keep], residual=self.residual[keep])
         some._values.update((scalars, values[:, :, keep]) for scalars, values in self._values.items())
         return some
+
+
+def as_instants(t):
+    """Instants (N, 1 + R) of times (N,) [s] where there are no references; instants as they are."""
+    return np.reshape(t, (len(t), -1))
 
 
 def at_nominal_size(jets, sizes, nq):
@@ -128,7 +143,7 @@ def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     same for all combinations of the rows, and leads on where rows are nearly dependent and curved. Returns z (nz, N)
     and the largest residual of each point (N,), relative to the size of its gradient times that of the jets.
     """
-    z, t = np.array(z, dtype=REAL), np.asarray(t, dtype=REAL)
+    z, t = np.array(z, dtype=REAL), np.asarray(as_instants(t), dtype=REAL)
     if not len(flow.equations):
         return z, np.zeros(len(t), dtype=REAL)
     scales, sizes = np.ones((len(flow.equations), len(t))), flow.points.sizes(flow.level)[:, None]
@@ -281,24 +296,24 @@ def sample(q, rows, level, context, starts=None, flow=None):
     the jets of earlier points `starts`. A `flow`, if given, has the same rows and level.
     """
     t, z = _random_starts(q, level, context)
-    if starts is not None and len(starts.t):
+    if starts is not None and len(starts):
         shared = min(len(z), len(starts.z))
         for i in range(POINTS):
-            again, p = divmod(i, len(starts.t))
-            t[i], z[:shared, i] = starts.t[p], starts.z[:shared, p] + again * SPREAD * z[:shared, i]
+            again, p = divmod(i, len(starts))
+            t[i], z[:shared, i] = starts.instants[p], starts.z[:shared, p] + again * SPREAD * z[:shared, i]
     starting = Points(
         q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book, context.scales
     )
     flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
     first = _solved(starting, flow, slice(POINTS))
     points = _with_inertia(first, context.saddle)
-    if len(points.t) == POINTS:
+    if len(points) == POINTS:
         return points
     others = _solved(starting, flow, slice(POINTS, None))
     points = points.joined(_with_inertia(others, context.saddle)).take(slice(POINTS))
-    if not len(points.t):  # as where every solution is in such a place
+    if not len(points):  # as where every solution is in such a place
         points = first.joined(others).take(slice(POINTS))
-    return points if len(points.t) else _solved(starting, flow, slice(POINTS), natural=True)
+    return points if len(points) else _solved(starting, flow, slice(POINTS), natural=True)
 
 
 def _with_inertia(points, saddle):
@@ -307,7 +322,7 @@ def _with_inertia(points, saddle):
     Where coordinates are singular, as longitude is at a pole, a balance vanishes with the inertia of its coordinate:
     such places solve the equations, and are no motions.
     """
-    if saddle is None or not len(points.t):
+    if saddle is None or not len(points):
         return points
     ranks = decide_each(clean(*points.matrix(saddle)))
     return points.take([i for i, r in enumerate(ranks) if r.rank == saddle.shape[0]])
@@ -320,7 +335,7 @@ def anywhere(q, level, context):
 
 
 def _random_starts(q, level, context):
-    """Times (2 POINTS,) in the window and jets (nz, 2 POINTS) about the guess, about zero where there is none."""
+    """Instants in the window and jets (nz, 2 POINTS) about the guess, about zero where there is none."""
     rng, nz = np.random.default_rng(POINTS_SEED), q.nq + level * q.n
     centre = np.array([q.identity.get(name, 0.0) for name in q.names] + [0.0] * level * q.n)
     usual = np.ones(nz) if context.scales is None else context.scales.jets(level)
@@ -332,14 +347,36 @@ def _random_starts(q, level, context):
                 size = abs(value) + SPREAD * context.sizes.get(name, usual[i])
                 centre[i], spread[i] = value / factorial(k), context.spread * size / factorial(k)
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
-    return np.asarray(rng.uniform(*context.window, 2 * POINTS), dtype=REAL), z
+    t = rng.uniform(*context.window, (2 * POINTS, 1))
+    r = rng.uniform(-1.0, 1.0, (2 * POINTS, len(q.family) * (JETS + 1)))
+    return np.hstack([t, r]).astype(REAL), z
 
 
 def _solved(starting, flow, some, natural=False):
     """The points of the manifold to which Newton's method converges from some of the starting points."""
-    z, residual = solve(flow, starting.t[some], starting.z[:, some], natural=natural)
-    points = replace(starting, t=starting.t[some], z=z, residual=residual.astype(float))
+    instants, z = starting.instants[some], starting.z[:, some]
+    if 0 in flow.members:
+        instants, z = aimed(flow.lowest, instants, z)
+    z, residual = solve(flow, instants, z, natural=natural)
+    points = replace(starting, instants=instants, z=z, residual=residual.astype(float))
     return points.take(np.flatnonzero(residual < ON_MANIFOLD))
+
+
+def aimed(lowest, instants, z):
+    """Instants and jets after steps of q and of the references towards rows of order 0: any posture is some target."""
+    nq, places = lowest.q.nq, np.arange(1, instants.shape[1], JETS + 1)
+    sizes = np.concatenate([lowest.points.sizes(0), np.ones(len(places))])[:, None]
+    instants, z = instants.copy(), np.array(z, dtype=REAL)
+    for _ in range(AIMING_STEPS):
+        if (aim := lowest.aim(instants, z[:nq])) is None:
+            break
+        residual, jacobian = aim
+        step = least_steps(jacobian, residual, sizes)
+        longest = np.max(np.abs(step) / (sizes + np.abs(np.vstack([z[:nq], instants[:, places].T]))), axis=0)
+        step = step / np.maximum(1.0, longest)
+        z[:nq] += step[:nq]
+        instants[:, places] += step[nq:].T
+    return instants, z
 
 
 @frozen

@@ -108,7 +108,7 @@ class Orders:
         shared = min(len(z), len(points.z))
         z[:shared] = points.z[:shared]
         start = replace(points, z=z)
-        solved, residual = solve(Flow(q, self.rows, self._level, start), start.t, z)
+        solved, residual = solve(Flow(q, self.rows, self._level, start), start.instants, z)
         return replace(start, z=np.where(residual < ON_MANIFOLD, solved, z))
 
 

@@ -157,7 +157,7 @@ def _refuse_square(q, row, context, slopes=None):
             return
     start = sample(q, [], row.order, context)
     flow = Flow(q, [row], row.order, start)
-    z, residual = solve(flow, start.t, start.z, iterations=SQUARE_STEPS)
+    z, residual = solve(flow, start.instants, start.z, iterations=SQUARE_STEPS)
     end = replace(start, z=z)
     before, after = (np.abs(points.matrix(gradient)[0]).max(axis=(0, 1)) for points in (start, end))
     # A gradient also vanishes if it changes by its own size where rounding of the row's terms moves the solution.
@@ -174,7 +174,7 @@ def _regular_nearby(flow, row, points):
     At a regular solution Newton's method has converged, as far as the rounding of the row's terms allows; towards that
     of a square its steps only halve the distance.
     """
-    t, z = points.t, points.z
+    t, z = points.instants, points.z
     residual, slopes = flow(t, z)
     beside = z * (1.0 + np.random.default_rng(POINTS_SEED).uniform(-BESIDE, BESIDE, z.shape))
     here, there = np.abs(slopes[0]).max(axis=0), np.abs(flow(t, beside)[1][0]).max(axis=0)
@@ -240,7 +240,7 @@ def alternatives(q, row, context):
 def _perhaps_factors(q, expression):
     """The jets at whose zeros an SX scalar is zero, or has no value, for some values of its other symbols."""
     symbols = ca.symvar(expression)
-    jets = [i for i, s in enumerate(symbols) if (q.where(s) or "t")[0] != "t"]
+    jets = [i for i, s in enumerate(symbols) if q.is_jet(s)]
     z = np.tile(0.8 + 0.5 * np.sin(1.0 + np.arange(len(symbols)))[:, None], len(jets))  # numbers without relations
     z[jets, range(len(jets))] = 0.0
     values = ca.Function("e", [ca.vertcat(*symbols)], [expression])(z).full().ravel() if jets else []

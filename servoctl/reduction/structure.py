@@ -7,7 +7,6 @@ which changes no rank.
 
 from collections import Counter
 from dataclasses import replace
-from math import factorial
 
 import casadi as ca
 import numpy as np
@@ -306,12 +305,8 @@ def _by_orders(reduction, names, orders):
 
 def points_of(reduction, t, jets, values):
     """Points of a motion from its samples."""
-    q, z = reduction.mechanism.q, np.array(jets, dtype=np.longdouble)
-    for k in range(1, (len(z) - q.nq) // q.n + 1):
-        z[q.nq + (k - 1) * q.n : q.nq + k * q.n] /= factorial(k)
     sample = reduction.points
-    values = sample.values if values is None else values
-    return replace(sample, t=np.asarray(t, dtype=np.longdouble), z=z, values=values, residual=np.zeros(len(t)))
+    return sample.at(t, np.asarray(jets, dtype=np.longdouble), sample.values if values is None else values)
 
 
 def _locals(reduction, points, states):
@@ -339,7 +334,7 @@ def _vanishing_jets(reduction, points):
     q = reduction.mechanism.q
     entries = ca.vertcat(ca.vec(ca.densify(reduction.leading)), ca.vec(ca.densify(reduction.realisation.B)))
     places = [q.where(s) for s in ca.symvar(entries)]
-    places = sorted((level, i) for kind, level, i in filter(None, places) if kind != "t")
+    places = sorted((level, i) for kind, level, i in filter(None, places) if kind in "qw")
     values = {q.jet_names(level)[i]: points.jet(level)[i] for level, i in places}
     limits = {name: AT_REST * max(1.0, float(np.abs(v).max())) for name, v in values.items()}
     return [tuple(name for name, v in values.items() if abs(v[p]) <= limits[name]) for p in range(len(points.t))]
@@ -366,7 +361,7 @@ def _jets(reduction, points, level, states):
     shared, state = min(len(z), len(points.z)), q.nq + q.n
     z[:shared] = points.z[:shared]
     if reduction.cascade is None:
-        solved, residual = solve(Flow(q, reduction.rows, level, points), points.t, z)
+        solved, residual = solve(Flow(q, reduction.rows, level, points), points.instants, z)
     else:
         deeper, good = reduction.cascade.continued(replace(points, z=z), level)
         solved, residual = deeper[: len(z)], np.where(good, 0.0, np.inf)
@@ -395,7 +390,7 @@ def _plant_jets(reduction, point, z, level):
     independent = [i for i in range(q.n) if i not in dependent]
     split = Realisation(G.T, None, tuple(dependent), tuple(independent), clean(*point.matrix(G)))
     forced, _ = split.dynamics(balance - B[:, :k] @ u)
-    return solve(Flow(q, [*material, *balances(q, forced)], level, point), point.t, z)[0]
+    return solve(Flow(q, [*material, *balances(q, forced)], level, point), point.instants, z)[0]
 
 
 def _input_jacobian(reduction, points, z, depth):
@@ -406,7 +401,7 @@ def _input_jacobian(reduction, points, z, depth):
     material = [row for row in reduction.original.values() if row.kind == "material"]
     program = [reduction.original[name] for name in reduction.program.residuals]
     flow = Flow(q, [], level, points)
-    series = flow.series(ca.vertcat(reduction.multipliers, ca.vec(ca.densify(B))).elements(), points.t, z, depth)
+    series = flow.series(ca.vertcat(reduction.multipliers, ca.vec(ca.densify(B))).elements(), points.instants, z, depth)
     u, b = series[: B.shape[1]], series[B.shape[1] :].reshape(B.shape[1], q.n, depth + 1, n_points)
     signals = {s.element_hash(): [u[i, j] for j in range(depth + 1)] for i, s in enumerate(inputs.elements())}
     balance = (reduction.balance - B @ inputs).elements()
@@ -417,7 +412,7 @@ def _input_jacobian(reduction, points, z, depth):
     ]
     flow = Flow(q, rows, level, points, signals, real=np.longdouble)
     columns = slice(q.nq + q.n, None)
-    jacobian = _without_rounding(flow(points.t, z)[1][:, columns])
+    jacobian = _without_rounding(flow(points.instants, z)[1][:, columns])
     place = {equation: e for e, equation in enumerate(flow.equations)}
     plant = [place[a, i] for i in range(depth + 1) for a in range(q.n)]
     bound = [place[q.n + m, i + 2 - row.order] for i in range(depth + 1) for m, row in enumerate(material)]

@@ -219,7 +219,7 @@ def _combinations(matrix):
 def _combined(q, rows, weights, pivot, known):
     """Row `pivot` with others added, in which other jets than those of known quasi-velocities cancel; or None."""
     moved_by, whole = _moved_by(q), sum(float(w) * row.expression for w, row in zip(weights, rows, strict=True) if w)
-    needs = {"t": lambda i: set(), "q": lambda i: moved_by[i], "w": lambda i: {i}}
+    needs = {"t": lambda i: set(), "r": lambda i: set(), "q": lambda i: moved_by[i], "w": lambda i: {i}}
     places = [(s, q.where(s)) for s in ca.symvar(whole)]
     others = [s for s, place in places if place and not needs[place[0]](place[2]) <= known]
     expression = ca.substitute(whole, ca.vertcat(*others), ca.SX.zeros(len(others))) if others else whole
@@ -232,7 +232,7 @@ def _combined(q, rows, weights, pivot, known):
 def _contents(q, row, moved_by):
     """The quasi-velocities whose jets, or whose coordinates, are in a row."""
     places = [q.where(s) for s in ca.symvar(row.expression)]
-    each = [moved_by[i] if kind == "q" else {i} for kind, _, i in filter(None, places) if kind != "t"]
+    each = [moved_by[i] if kind == "q" else {i} for kind, _, i in filter(None, places) if kind in "qw"]
     return set().union(*each)
 
 

@@ -11,6 +11,7 @@ from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero
 from servoctl.jets.tape import Tape, divide, multiply
+from servoctl.spec.references import JETS, Family
 from servoctl.units import units_by_name
 
 _lock = threading.Lock()
@@ -71,6 +72,7 @@ class Coordinates:
         self.velocity_names = tuple(f"d{name}" for name in names)
         self.V, self.h, self.invariants, self.spheres = ca.SX.eye(self.nq), ca.SX.zeros(self.nq), {}, ()
         self.plain, self.identity = True, {}  # values that a posture has where it is not given, and that are not zero
+        self.family = Family()  # of the references
         self._whole = None  # of a part: the coordinates whose symbols it has, and the places of its velocities there
 
     def __iter__(self):
@@ -136,7 +138,7 @@ class Coordinates:
         names = _identifiers(names, "quasi-velocities")
         V = matrix(V, "V", (self.nq, len(names)))
         other = Coordinates(self.names, self.units)
-        other.t, other._q, other.plain = self.t, self._q, False
+        other.t, other._q, other.plain, other.family = self.t, self._q, False, self.family
         other._index = {key: value for key, value in self._index.items() if value[0] != "w"}
         other.V = V
         other.h = ca.vertcat(*column([0.0] * self.nq if h is None else h, "h", self.nq))
@@ -186,7 +188,7 @@ class Coordinates:
         Coordinates
         """
         other = Coordinates(tuple(self.names[i] for i in places))
-        other.t, other._q = self.t, tuple(self._q[i] for i in places)
+        other.t, other._q, other.family = self.t, tuple(self._q[i] for i in places), self.family
         other._index = {self.t.element_hash(): ("t", 0, 0)}
         other._index |= {s.element_hash(): ("q", 0, i) for i, s in enumerate(other._q)}
         other.velocity_names = tuple(self.velocity_names[i] for i in velocities)
@@ -241,6 +243,27 @@ class Coordinates:
             return Column(self.derivatives(self._q, k)[k])
         return Column(self.gamma(k))
 
+    def references(self, **paths):
+        """Signals that a program follows, by name, with the paths that they follow until told otherwise.
+
+        Parameters
+        ----------
+        **paths : Path or None
+            None: no path yet.
+
+        Returns
+        -------
+        r : References
+            The symbols: `r.X`, `r["X"]`, and their derivatives in the order of the names, `r.d(1)`. Equations may
+            contain them as they contain t.
+
+        Raises
+        ------
+        SpecificationError
+            If a name is a reference already.
+        """
+        return self.family.add(paths)
+
     def dt(self, expression, k=1):
         """The k-th total time derivative of an expression of t, q and the jets.
 
@@ -260,13 +283,17 @@ class Coordinates:
         return ca.reshape(result, *expression.shape) if isinstance(expression, ca.SX) else result
 
     def where(self, symbol):
-        """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), or None."""
+        """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), ("r", k, i) for r_i^(k), or None."""
         key = require_kind(ca.SX, "symbol", symbol, "q.d(1)").element_hash()
         if key not in self._index and self._whole is not None:
             kind, k, i = self._whole[0].where(symbol) or ("", 0, 0)
             if kind == "w" and i in self._whole[1]:
                 self.gamma(k)
-        return self._index.get(key)
+        return self._index.get(key) or self.family.where(key)
+
+    def is_jet(self, symbol):
+        """Whether a symbol is a coordinate, or one of the jets of a quasi-velocity."""
+        return (self.where(symbol) or "t")[0] in "qw"
 
     def order(self, expression):
         """The highest k for which γ^(k) is in an expression; 0 for q alone, -1 for neither."""
@@ -309,7 +336,8 @@ class Coordinates:
         """
         free = ca.Function("expressions", [], list(expressions), {"allow_free": True}).free_sx()
         highest = max([0, *map(self.order, free)])
-        return ca.Function("expressions", self._arguments(highest, parameters), list(expressions))
+        followed = 1 + max([-1, *(place[2] for place in map(self.where, free) if place and place[0] == "r")])
+        return ca.Function("expressions", self._arguments(highest, followed, parameters), list(expressions))
 
     def from_function(self, function, parameters=()):
         """The expressions of a function by `as_function`, perhaps of another process, in these symbols.
@@ -324,17 +352,21 @@ class Coordinates:
         -------
         list of SX
         """
-        return function.call(self._arguments(function.n_in() - 3, parameters), True, False)
+        followed = function.numel_in(0) // (JETS + 1)
+        return function.call(self._arguments(function.n_in() - 4, followed, parameters), True, False)
 
-    def _arguments(self, highest, parameters):
+    def _arguments(self, highest, followed, parameters):
+        """All jets of the references `followed` in number, t, those of the coordinates up to `highest`, parameters."""
+        references = [self.family.jet(name, k) for name in self.family.names[:followed] for k in range(JETS + 1)]
         jets = [self.jet(k) for k in range(highest + 1)]
-        return [self.t, *jets, ca.vertcat(ca.SX(0, 1), *parameters)]
+        return [ca.vertcat(ca.SX(0, 1), *references), self.t, *jets, ca.vertcat(ca.SX(0, 1), *parameters)]
 
     def __reduce__(self):
         if self.plain:
-            return Coordinates, (self.names, self.units)
+            return Coordinates, (self.names, self.units), {"family": self.family}
         frame = self.as_function([self.V, self.h, *self.invariants.values()])
-        return _moved, (self.names, self.units, self.velocity_names, frame, tuple(self.invariants), self.identity)
+        parts = self.names, self.units, self.velocity_names, frame, tuple(self.invariants), self.identity, self.family
+        return _moved, parts
 
     def _series(self, expressions, k):
         """Coefficients 0 to k of expressions, followed by those of q' = V w + h if these contain q and q' is not w."""
@@ -374,6 +406,9 @@ class _SymbolicMotion(Motion):
     def velocity(self, i, level, j):
         return divide(self.q.gamma(level + j)[i], float(factorial(j)))
 
+    def reference(self, i, level, j):
+        return divide(self.q.family.jet(self.q.family.names[i], level + j), float(factorial(j)))
+
 
 def symbols_in(expression):
     """The symbols in an SX expression; CasADi's search is left out where there is nothing to search."""
@@ -382,9 +417,10 @@ def symbols_in(expression):
     return [expression] if expression.is_scalar() and expression.is_symbolic() else ca.symvar(expression)
 
 
-def _moved(names, units, velocity_names, frame, invariants, identity):
+def _moved(names, units, velocity_names, frame, invariants, identity, family):
     """Coordinates with quasi-velocities, unpickled."""
     q = Coordinates(names, units)
+    q.family = family
     V, h, *values = q.from_function(frame)
     moved = q.with_quasi_velocities(" ".join(velocity_names), V, h, dict(zip(invariants, values, strict=True)))
     moved.identity = identity

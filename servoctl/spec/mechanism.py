@@ -204,7 +204,7 @@ class Mechanism(Shown):
         """Coordinates and velocities in expressions: a set of ("q", i) and ("w", i)."""
         expressions = (e if e.__class__ is ca.SX else ca.SX(e) for e in expressions)
         found = (self.q.where(s) for e in expressions for s in symbols_in(e))
-        return {(place[0], place[2]) for place in found if place is not None and place[0] != "t"}
+        return {(place[0], place[2]) for place in found if place is not None and place[0] in "qw"}
 
     def couplings(self):
         """What is coupled: a list of sets of places, one for each term.
