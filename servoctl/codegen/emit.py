@@ -1,6 +1,7 @@
 """C text of an SX function from its instruction list, and translation units with loops over it.
 
-The function is a ``casadi.Function`` with inputs t (scalar), x (n_x), p (n_p) and one dense column output y (n_y). A
+The function is a ``casadi.Function`` with inputs t (scalar), x (n_x), p (n_p) and one dense column output y (n_y); a
+fourth input are jets of references, which C takes from paths (see `codegen.paths`), into the first numbers of w. A
 `Dialect` defines how numbers are written: as ``double``, or as vectors whose lanes are points. A long function is cut
 into chunks that share a work vector, because compilers need more than linear time for one long function. Where several
 values have the same divisor, such as a pivot, they are multiplied with its reciprocal: a division takes as long as
@@ -16,6 +17,7 @@ import casadi as ca
 from servoctl.codegen.chains import short_chains, time_of
 from servoctl.codegen.collecting import collected, ways
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
+from servoctl.codegen.paths import BY_INSTANT, jets_in
 from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
 from servoctl.jets.branches import apply_code
 from servoctl.jets.lookup import lookup_at, lookups
@@ -143,7 +145,7 @@ def other_ways(f):
     lookups = any(not isinstance(operation, int) for _, operation, _ in statements)
     if lookups or len(statements) > CHUNK:
         return []
-    inputs = dict(zip("txp", f.sx_in(), strict=True))
+    inputs = dict(zip("txpw", map(ca.vec, f.sx_in()), strict=False))
     return [_of_statements(way, inputs) for way in ways(statements)[1:]]
 
 
@@ -249,12 +251,14 @@ def include(name):
 def function(f, name, dialect=SCALAR, chunk=CHUNK):
     """C text of one function y = f(t, x, p), cut into chunks of at most `chunk` statements."""
     statements, tables = _prepared(f, dialect)
-    chunks = _cut(statements, chunk)
+    chunks, first, jets = _cut(statements, chunk), jets_in(f), _jets_line(f, dialect)
     if len(chunks) == 1:
-        return "".join((*tables, dialect.head(name), *(_line(s, dialect) for s in statements), "}\n"))
+        jets = f"    {dialect.number} w[{first}];\n{jets}" if first else ""
+        return "".join((*tables, dialect.head(name), jets, *(_line(s, dialect) for s in statements), "}\n"))
     names = [f"{name}_{here}" for here in range(len(chunks))]
-    text, size = _sharing(names, chunks, [0] * len(chunks), dialect)
-    return "".join(tables) + text + dialect.head(name) + f"    {dialect.number} w[{size}];\n" + _calls(names) + "}\n"
+    text, size = _sharing(names, chunks, [0] * len(chunks), dialect, first)
+    work = f"    {dialect.number} w[{size}];\n{jets}"
+    return "".join(tables) + text + dialect.head(name) + work + _calls(names) + "}\n"
 
 
 def by_phase(f, step):
@@ -283,7 +287,7 @@ def phases(f, name, given, dialect=SCALAR, chunk=CHUNK):
     the last one.
     """
     statements, tables = given
-    return "".join(_with_lookups(tables, f, dialect)) + _in_phases(name, PHASES, statements, dialect, chunk)
+    return "".join(_with_lookups(tables, f, dialect)) + _in_phases(f, name, PHASES, statements, dialect, chunk)
 
 
 def series(f, name, dialect=SCALAR, chunk=CHUNK):
@@ -298,7 +302,7 @@ def series(f, name, dialect=SCALAR, chunk=CHUNK):
         alone = isinstance(target, int) and all(_is_still(v, still) for v in operands)
         still.update([target] if alone else [])
         parts[not alone].append(statement)
-    return "".join(tables) + _in_phases(name, SERIES, parts, dialect, chunk)
+    return "".join(tables) + _in_phases(f, name, SERIES, parts, dialect, chunk)
 
 
 def _is_still(operand, still):
@@ -306,13 +310,18 @@ def _is_still(operand, still):
     return operand in still if isinstance(operand, int) else isinstance(operand, Constant) or operand.startswith("p[")
 
 
-def _in_phases(name, phases, parts, dialect, chunk):
-    """C text of a function in phases, each with its statements, and of the function that calls all of them."""
+def _in_phases(f, name, phases, parts, dialect, chunk):
+    """C text of a function in phases, each with its statements, and of the function that calls all of them.
+
+    The first phase of `PHASES`, and the second of `SERIES`, which has the time, computes jets of references.
+    """
     parts = [_cut(part, chunk) for part in parts]
     wholes = [f"{name}_{phase}" for phase in phases]
     names = [[f"{w}_{k}" for k in range(len(c))] if len(c) > 1 else [w] for w, c in zip(wholes, parts, strict=True)]
     of = [k for k, chunks in enumerate(parts) for _ in chunks]
-    text, size = _sharing(list(chain(*names)), list(chain(*parts)), of, dialect)
+    timed, jets = phases.index("instant" if phases is PHASES else "moving"), _jets_line(f, dialect)
+    at_begin = {names[timed][0]: jets} if jets else {}
+    text, size = _sharing(list(chain(*names)), list(chain(*parts)), of, dialect, jets_in(f), at_begin)
     static = replace(dialect, linkage="static ")
     for whole, some in zip(wholes, names, strict=True):
         text += static.head(whole, work=True) + _calls(some) + "}\n" if len(some) > 1 else ""
@@ -344,7 +353,26 @@ def _prepared(f, dialect, suffix=""):
 def _with_lookups(tables, f, dialect):
     """C texts of tables and of what the lookups of a function need."""
     tables = tables + [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
-    return [include("table_lanes.h" if dialect.prefix else "table.h"), *tables] if tables else []
+    texts = [include("table_lanes.h" if dialect.prefix else "table.h"), *tables] if tables else []
+    if not jets_in(f):
+        return texts
+    name = f"{dialect.prefix.upper()}PATH_JETS"
+    once = f"#ifndef HAS_{name}_{(order := _highest(f))}\n#define HAS_{name}_{order}\n{name}({order})\n#endif\n"
+    return [*texts, include("path_lanes.h" if dialect.prefix else "path.h"), once]
+
+
+def _highest(f):
+    """The highest derivative among them."""
+    return f.size2_in(3) - 1
+
+
+def _jets_line(f, dialect):
+    """C line that takes the jets at t from the paths at p[0], of the piece that the last number of p may select."""
+    if not jets_in(f):
+        return ""
+    paths = dialect.operand("p", 0)
+    instant = dialect.operand("p", f.numel_in(2) - 1) if f.name_in(3) == BY_INSTANT else "t"
+    return f"    {dialect.prefix}path_jets_{_highest(f)}({paths}, {instant}, t, {f.size1_in(3)}, w);\n"
 
 
 def _statements(f, dialect, suffix=""):
@@ -356,7 +384,7 @@ def _statements(f, dialect, suffix=""):
     for k in range(f.n_instructions()):
         operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
-            register[target[0]] = dialect.operand("txp"[source[0]], source[1], suffix)
+            register[target[0]] = dialect.operand("txpw"[source[0]], source[1], suffix)
         elif operation == ca.OP_CONST:
             register[target[0]] = Constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
@@ -427,16 +455,17 @@ def _operand_text(operand, dialect, value):
     return operand if isinstance(operand, str) else f"{value}{operand}"
 
 
-def _sharing(names, chunks, of, dialect):
+def _sharing(names, chunks, of, dialect, first=0, at_begin=None):
     """C text of functions, one for each chunk, that share a work vector w, and its length.
 
-    `of` are the phases of the chunks: a function that is the only one of its phase may be inlined.
+    `of` are the phases of the chunks: a function that is the only one of its phase may be inlined. The `first` numbers
+    of w are jets of references; `at_begin` has lines with which some functions begin, by name.
     """
     home = {target: here for here, chunk in enumerate(chunks) for target, _, _ in chunk if isinstance(target, int)}
-    slots, n_slots = _slots(chunks, home, of)
+    slots, n_slots = _slots(chunks, home, of, first)
     text = "".join(
         f"{(replace(dialect, linkage='static ') if of.count(k) == 1 else dialect).head(name, work=True)}"
-        f"{_chunk(chunk, slots, home, here, dialect)}}}\n"
+        f"{(at_begin or {}).get(name, '')}{_chunk(chunk, slots, home, here, dialect)}}}\n"
         for here, (name, chunk, k) in enumerate(zip(names, chunks, of, strict=True))
     )
     return text, n_slots + 1
@@ -457,8 +486,8 @@ def _chunk(statements, slots, home, here, dialect):
     return "".join(lines)
 
 
-def _slots(chunks, home, of):
-    """Index in w of each value that outlives its chunk, and the number of indices.
+def _slots(chunks, home, of, first):
+    """Index in w, at least `first`, of each value that outlives its chunk, and the number of indices.
 
     An index is free again after the last chunk that reads the value, unless that is of another phase, which may be
     repeated.
@@ -468,7 +497,7 @@ def _slots(chunks, home, of):
         for v in chain.from_iterable(operands for _, _, operands in chunk):
             if isinstance(v, int):
                 last[v] = here if of[here] == of[home[v]] else len(chunks)
-    expiring, free, slots, n_slots = [[] for _ in range(len(chunks) + 1)], [], {}, 0
+    expiring, free, slots, n_slots = [[] for _ in range(len(chunks) + 1)], [], {}, first
     for here, chunk in enumerate(chunks):
         free += expiring[here - 1] if here else []
         for target, _, _ in chunk:

@@ -22,6 +22,7 @@ from servoctl.codegen.loops import (
     STEADY,
 )
 from servoctl.codegen.machine import ENOUGH, machine
+from servoctl.codegen.paths import evaluated, jets_at, jets_in, with_jets
 
 BLOCK = 128  # instants of a path that are solved together
 MANY_POINTS = 2_000  # of them CasADi takes longer, one by one, than writing the list of operations takes
@@ -81,19 +82,19 @@ class StepsOfThread:
 class Blocks(threading.local):
     """Memory of one thread for the t, x, p and y (size, BLOCK) of a block, and the call that fills y."""
 
-    def __init__(self, block, sizes):
+    def __init__(self, block, sizes, connect):
         parts = [np.zeros((size, BLOCK), order="F") for size in sizes]
-        run, self._alive = connected(block, [part.ravel("K") for part in parts])
+        run, self._alive = connect(block, [part.ravel("K") for part in parts])
         self.parts = parts, run
 
 
 def connected(f, parts):
-    """The call of a CasADi function on arrays t, x, p, y, and the buffer that must live as long as the call."""
+    """The call of a CasADi function on arrays of its inputs and y, and the buffer that must live as long as it."""
     with _guard:
         buffer, run = f.buffer()
-    for i, part in enumerate(parts[:3]):
+    for i, part in enumerate(parts[:-1]):
         buffer.set_arg(i, memoryview(part))
-    buffer.set_res(0, memoryview(parts[3]))
+    buffer.set_res(0, memoryview(parts[-1]))
     return run, buffer
 
 
@@ -108,7 +109,21 @@ class Interpreter:
         self.workspace = Workspace(*self._parts[1:], self._connect)
 
     def _connect(self, row, parts):
-        return connected(self._f, parts)
+        return self._connected(self._f, parts)
+
+    def _connected(self, f, parts):
+        """The call of the function, at one point or several, on arrays t, x, p, y; jets follow from t and p."""
+        if not jets_in(self._f):
+            return connected(f, parts)
+        t, p = np.reshape(parts[0], -1), np.reshape(parts[2], (-1, self._parts[2]))
+        r = np.zeros((len(t), jets_in(self._f)))
+        run, alive = connected(f, [*parts[:3], r, parts[3]])
+
+        def filled():
+            r[:] = jets_at(self._f, t, p.T).T
+            run()
+
+        return filled, alive
 
     def _value(self, t, x, p):
         row_t, row_x, row_p, row_y, run = self.workspace.row
@@ -123,7 +138,7 @@ class Interpreter:
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
         self._points += t.size
         if self._points >= MANY_POINTS and t.size >= ENOUGH and self._machine is not None:
-            self._machine.grid(t, x, p, y)
+            self._machine.grid(t, x, with_jets(self._f, t, p), y)
             return
         left = t.size % BLOCK
         blocks = t.size - left * (left < BLOCK // 2)  # a block with half as many points is faster than these one by one
@@ -144,7 +159,7 @@ class Interpreter:
 
     @functools.cached_property
     def _blocks(self):
-        return Blocks(self._block, self._parts)
+        return Blocks(self._block, self._parts, self._connected)
 
     @functools.cached_property
     def _machine(self):
@@ -271,7 +286,7 @@ class Interpreter:
         path, k, alone = self._path(p), 0, 0
         (_, n_x, _, n_y), rows = self._parts, len(z)
         parts = np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, n_y))
-        call = connected(self._block, parts) if t.size >= BLOCK else None
+        call = self._connected(self._block, parts) if t.size >= BLOCK else None
         forward = nodes[-1, 0] >= nodes[0, 0]
         ends = nodes[1:, 0] if forward else -nodes[1:, 0]
         first = np.minimum(np.searchsorted(ends, t if forward else -t), max(len(nodes) - 2, 0))
@@ -295,7 +310,7 @@ class Interpreter:
 def restored(project, t, x, p):
     """The state with its invariants restored, by Newton's iteration as in restore.h."""
     for _ in range(6):
-        d = np.asarray(project(t, x, p[: project.numel_in(2)])).ravel()
+        d = evaluated(project, t, x, p)
         if not np.isfinite(d).all():
             return x
         largest, x = np.max(np.abs(d) / (1 + np.abs(x)), initial=0.0), x + d

@@ -33,7 +33,7 @@ class Machine:
     def __init__(self, f, run):
         self._run, self._rows = run, f.sz_w()
         code, constants = np.zeros((f.n_instructions(), 4), dtype=np.int32), np.zeros(f.n_instructions())
-        first = np.cumsum([0, 1, f.numel_in(1)])  # of t, x and p in one list of inputs
+        first = np.cumsum([0, 1, f.numel_in(1), f.numel_in(2)])  # of t, x, p and jets in one list of inputs
         for k in range(len(code)):
             operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
             if operation == ca.OP_INPUT:

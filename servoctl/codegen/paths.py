@@ -1,0 +1,81 @@
+"""References in compiled functions: tables of paths in memory, of which a function receives the address as a number.
+
+A function f(t, x, p, r) contains jets of references r, an input (n, K + 1) with the derivatives 0 .. K of n references.
+Who calls it gives t, x and p alone: the first number of p is the address of the `Followed` paths, from which its C code
+takes the jets at each instant that it evaluates; CasADi receives those that NumPy takes from the paths.
+"""
+
+import weakref
+
+import numpy as np
+
+from servoctl.errors import SpecificationError
+
+BY_INSTANT = "of_piece"  # name of the fourth input of a function whose last parameter selects the pieces of paths
+RULES = {None: 0, "hold": 0, "continue": 1, "periodic": 2}  # as in path.h
+
+_alive = weakref.WeakValueDictionary()  # by address
+
+
+class Followed:
+    """The paths that references follow, as C reads them.
+
+    `address` is a number of p for as long as this object lives; `jets` has the derivatives at some instants.
+    """
+
+    def __init__(self, components):
+        self.components = tuple(components)  # (path, place of its component) of each reference
+        self._table = np.zeros((len(self.components), 7), dtype=np.int64)
+        for row, (path, i) in zip(self._table, self.components, strict=True):
+            pieces, dim, size = path.coefficients.shape
+            rules = RULES[path.before], RULES[path.after]
+            places = path.breaks.ctypes.data, path.coefficients.ctypes.data + 8 * i * size
+            row[:] = pieces, dim * size, size, *rules, *places
+        self.address = float(self._table.ctypes.data)
+        _alive[self.address] = self
+
+    def jets(self, t, order, instant=None):
+        """Derivatives 0 .. `order` at times (N,), of the pieces that instants (N,) select: ((order + 1) n, N)."""
+        rows = [path[i].jets(t, order, instant)[:, 0] for path, i in self.components]
+        return np.stack(rows, axis=1).reshape(-1, len(t))
+
+
+def followed(address):
+    """The paths at an address of p."""
+    if (paths := _alive.get(float(address))) is None:
+        raise SpecificationError(
+            "A function of references was called without their paths.",
+            "Its parameters p begin with the place of the paths in memory, which a model keeps.",
+            do="Pass model.p, and keep the model.",
+        )
+    return paths
+
+
+def jets_in(f):
+    """The number of jets of references that a function takes."""
+    return f.numel_in(3) if f.n_in() > 3 else 0
+
+
+def jets_at(f, t, p):
+    """The jets (numbers, N) that a function takes at times (N,) with parameters p (n_p,) or (n_p, N)."""
+    p = np.broadcast_to(np.reshape(p, (len(p), -1)), (len(p), len(t)))
+    instants = p[-1] if f.name_in(3) == BY_INSTANT else t
+    jets = np.empty((jets_in(f), len(t)))
+    for address in np.unique(p[0]):
+        some = p[0] == address
+        jets[:, some] = followed(address).jets(t[some], f.size2_in(3) - 1, instants[some])
+    return jets
+
+
+def with_jets(f, t, p):
+    """Parameters (n_p,) or (n_p, N), with the jets that a function takes at times (N,) below them, if any."""
+    if not jets_in(f):
+        return p
+    return np.vstack([np.broadcast_to(np.reshape(p, (len(p), -1)), (len(p), len(t))), jets_at(f, t, p)])
+
+
+def evaluated(f, t, x, p):
+    """The output (n_y,) of a CasADi function at one point, with the first of the parameters p that it takes."""
+    p = np.asarray(p)[: f.numel_in(2)]
+    jets = [jets_at(f, np.array([float(t)]), p).reshape(f.size_in(3), order="F")] if jets_in(f) else []
+    return np.asarray(f(t, x, p, *jets)).ravel()
