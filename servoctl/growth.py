@@ -428,7 +428,7 @@ def _kernel(model, t, x, size):
 
 def _slopes(model, name, t, x, rows):
     """The Jacobian of `rows` values by the state at N points, (N, rows, n_x): the last outputs of a function."""
-    values = _grid(model.function(name).interpreted, t, x, model.parameters)[-rows * len(x) :]
+    values = _grid(model.function(name).interpreted, t, x, model.p)[-rows * len(x) :]
     return values.T.reshape(len(t), len(x), rows).swapaxes(1, 2)
 
 

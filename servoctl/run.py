@@ -273,7 +273,7 @@ class Run(Sampled, Value):
                     names=names,
                     jets=needed,
                 )
-            parts.append(f.grid(self.t[first:end], jets, model.parameters))
+            parts.append(f.grid(self.t[first:end], jets, model.p))
         return names, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def require_model(self):
@@ -376,7 +376,7 @@ class Run(Sampled, Value):
 
     def _coordinate_rates(self, columns):
         _, f = self.model.signals("coordinate_rates")
-        values = f.grid(self.t[columns], self.jets[: f.n_x, columns], self.model.parameters)
+        values = f.grid(self.t[columns], self.jets[: f.n_x, columns], self.model.p)
         return [values[: self.model.nq], values[self.model.nq :]]
 
     def extrema(self, name: str) -> tuple[tuple[float, float], tuple[float, float]]:

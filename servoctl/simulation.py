@@ -412,7 +412,7 @@ def _fitting_tolerances(model, method, motion, t0):
     if isinstance(method, RadauIIA) and method.step is not None:
         return None
     t, x = motion.t[-1], motion.jets[: len(model.state_names), -1]
-    inertia = model.function("matrices")(t, x, model.parameters)[-model.n :]
+    inertia = model.function("matrices")(t, x, model.p)[-model.n :]
     sizes = sizes_of(model, inertia, largest, t - t0)
     if isinstance(method, Taylor):
         unlike = unlike_tolerances(state_levels(model), largest, sizes, method.atol)
@@ -540,7 +540,7 @@ def _as_started(model, start, t, x):
 def _scaled_residuals(model, t, x):
     """Names of the invariants, their values, and these relative to their gradients times the state."""
     names = [name for _, name in invariant_names(model)]
-    y = model.function("invariants")(t, x, model.parameters)
+    y = model.function("invariants")(t, x, model.p)
     values, slopes = y[: len(names)], y[len(names) :].reshape(len(x), len(names))
     square = (1.0 + np.abs(x)) ** 2 @ slopes**2
     off = np.abs(values) / np.sqrt(np.where(square > 0, square, 1.0))
@@ -551,7 +551,7 @@ def consistent_state(model, start, t, project=False):
     """The state that a start gives, or its projection, which must satisfy the invariants: nothing would lead back."""
     x, before = as_state(model, start, t), np.inf
     while project and (off := np.abs(_scaled_residuals(model, t, x)[2]).max(initial=0.0)) < before:
-        x, before = model.function("ode_projected").restore(t, x, model.parameters), off
+        x, before = model.function("ode_projected").restore(t, x, model.p), off
     names, values, off = _scaled_residuals(model, t, x)
     if off.max(initial=0.0) > OFF:
         worst = int(np.argmax(off))

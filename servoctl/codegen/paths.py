@@ -7,6 +7,7 @@ takes the jets at each instant that it evaluates; CasADi receives those that Num
 
 import weakref
 
+import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
@@ -74,8 +75,27 @@ def with_jets(f, t, p):
     return np.vstack([np.broadcast_to(np.reshape(p, (len(p), -1)), (len(p), len(t))), jets_at(f, t, p)])
 
 
-def evaluated(f, t, x, p):
-    """The output (n_y,) of a CasADi function at one point, with the first of the parameters p that it takes."""
+def arguments(f, t, x, p):
+    """What a CasADi function takes at one point: t, x, as many of the parameters, and jets of references, if any."""
     p = np.asarray(p)[: f.numel_in(2)]
     jets = [jets_at(f, np.array([float(t)]), p).reshape(f.size_in(3), order="F")] if jets_in(f) else []
-    return np.asarray(f(t, x, p, *jets)).ravel()
+    return t, x, p, *jets
+
+
+def evaluated(f, t, x, p):
+    """The output (n_y,) of a CasADi function at one point."""
+    return np.asarray(f(*arguments(f, t, x, p))).ravel()
+
+
+def combined(name, build, *functions):
+    """The function (t, x, p) whose output is `build(x, p, *outputs)` of those of functions of the first x and p."""
+    longest = max(functions, key=lambda f: f.numel_in(1))
+    t, x, p = longest.sx_in()[:3]
+    r = max((f.sx_in()[3] for f in functions if jets_in(f)), key=ca.SX.numel, default=None)
+    outputs = []
+    for f in functions:
+        jets = [r[:, : f.size2_in(3)]] if jets_in(f) else []
+        outputs.append(f(t, x[: f.numel_in(1)], p[: f.numel_in(2)], *jets))
+    kinds = {f.name_in(3) for f in functions if jets_in(f)}
+    inputs = {"t": t, "x": x, "p": p} | {kind: r for kind in kinds}
+    return ca.Function(name, [*inputs.values()], [ca.densify(ca.SX(build(x, p, *outputs)))], [*inputs], ["y"])

@@ -385,7 +385,7 @@ class Relaxation(Transfer):
         x = plan.x @ mesh.of_states(t)
         v = self._inputs_of(plan, t)
         jets = np.vstack([x, np.array(self.node.function("motion", self.node.acceleration).map(len(t))(t[None], x, v))])
-        if not np.isfinite(model.function("ode").grid(t, x, model.parameters)).all():
+        if not np.isfinite(model.function("ode").grid(t, x, model.p)).all():
             model = derived_near(model, t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}
         run = Run(

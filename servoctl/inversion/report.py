@@ -315,7 +315,7 @@ def _directions(model, ends):
     if model.reduction.ideal or not ends:
         return None
     t, x = ends[0]
-    return directions(model.reduction, [t], x[:, None], model.parameters)[0]
+    return directions(model.reduction, model.instants([t]), x[:, None], model.parameters)[0]
 
 
 def _ranks(model, structure, run, ends):
@@ -343,7 +343,10 @@ def _margins(run, some, part):
     """Margins of the variant (first, end, model) at those of some samples that it holds for."""
     first, end, variant = part
     inside = some[(some >= first) & (some < end)]
-    return margins(variant.reduction, run.t[inside], run.jets[:, inside], variant.parameters) if len(inside) else []
+    if not len(inside):
+        return []
+    instants = variant.instants(run.t[inside])
+    return margins(variant.reduction, instants, run.jets[:, inside], variant.parameters)
 
 
 def _typical(local, structure):

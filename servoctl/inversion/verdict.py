@@ -186,7 +186,7 @@ def _derived_for(model, motion, t, x):
 
 def _lost_rank(model, t, x):
     """What is lost where the equations have not the rank that they have in motion; "" if nothing is."""
-    if margins(model.reduction, [t], x[:, None], model.parameters)[0] != 0:
+    if margins(model.reduction, model.instants([t]), x[:, None], model.parameters)[0] != 0:
         return ""
     there, usual = model.structure([t], x[:, None]), model.structure()
     if not (there.zeros_at_infinity and usual.zeros_at_infinity):

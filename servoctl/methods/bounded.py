@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import combined
 from servoctl.errors import (
     IntegrationStopped,
     LimitExceeded,
@@ -88,7 +89,7 @@ def bounded(model, span, guess, method, instants, progress, events=None):
         times, motion.ended = _to_event(problem, events, (mesh, x), times)
     samples = problem.at(times, mesh, x)
     truncation = problem.distance(samples, problem.at(times, *reference))
-    outputs = model.function("ode").grid(times, samples, model.parameters)
+    outputs = model.function("ode").grid(times, samples, model.p)
     problem.require_pivots(times, outputs[problem.n_x :])
     motion.add(model, times, samples, outputs[problem.n_x - model.n : problem.n_x])
     motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s{left_out}; "
@@ -228,7 +229,7 @@ class FreeEntries:
     """
 
     def __init__(self, model, t, guess):
-        self.model, self.p = model, model.parameters
+        self.model, self.p = model, model.p
         self._equations = model.once("bounded", lambda: _equations(model))
         self.n_x, self.m = len(model.state_names), len(invariant_names(model))
         self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *model.knots)
@@ -626,9 +627,8 @@ class Problem(FreeEntries):
 def _equations(model):
     """One compiled function: X', ∂X'/∂X, the invariants and their Jacobian, both by columns."""
     rates, slopes, invariants = (model.function(name).expression for name in ("ode", "ode_jacobian", "invariants"))
-    t, x, p = (ca.SX.sym(name, rates.size1_in(i)) for i, name in enumerate("txp"))
-    values = [rates(t, x, p)[: rates.size1_in(1)], slopes(t, x, p), invariants(t, x, p)]
-    f = ca.Function("bounded", [t, x, p], [ca.densify(cse(ca.vertcat(*values)))])
+    parts = rates, slopes, invariants
+    f = combined("bounded", lambda x, _, y, *others: cse(ca.vertcat(y[: x.numel()], *others)), *parts)
     return compiled(f, "bounded", ("rk",))  # which is called at many points, and therefore compiled
 
 

@@ -136,7 +136,7 @@ class BulkSteps(Stepping):
         k, at, x, rates = self.net
         first = stretch.t[:1], stretch.x[:, :1]
         parts = np.append(first[0], at), np.column_stack([first[1], x])
-        more = centres(steep, self.model.parameters, *parts, lambda s: stretch.dense(steps_of(stretch.t, s), s))
+        more = centres(steep, self.model.p, *parts, lambda s: stretch.dense(steps_of(stretch.t, s), s))
         places = steps_of(stretch.t, more)
         added = stretch.dense(places, more)
         rates = np.column_stack([rates, self.f.grid(more, added, self.p)[: self.n_x]])

@@ -50,7 +50,7 @@ class Deviations:
         self.Q, self.Z = np.empty((free, len(x))), np.empty((free, len(x), padded(len(instants))))
         settings, self._defect = np.array([RTOL, RTOL * size.min(), NEARBY, LEFT_OUT]), np.empty(1)
         series = np.empty((free, 1 + f.n_x + f.n_y))
-        given = cuts, instants, np.append(model.parameters, np.nan), settings, size, active
+        given = cuts, instants, np.append(model.p, np.nan), settings, size, active
         self._arrays = [np.ascontiguousarray(array, dtype=float) for array in given]
         counts = len(cuts), len(instants), len(x) - np.count_nonzero(active), free, MOST_ALONG
         places = [array.ctypes.data for array in (*self._arrays, self.x, self.Q, self.Z, series)]

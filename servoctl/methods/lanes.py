@@ -12,6 +12,7 @@ import numpy as np
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import TAYLOR_COMPILED, compiled
 from servoctl.codegen.native import pointer
+from servoctl.codegen.paths import combined
 from servoctl.methods.algebraic import NODES, STEPS, switched
 from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE
 from servoctl.methods.motion import breakpoints
@@ -191,12 +192,13 @@ def _plan_library(f, model):
 def _off_manifold(model):
     """The largest residual of the invariants, relative to its gradient times the state, as a function of (t, X, p)."""
     f, m = model.function("invariants").expression, len(invariant_names(model))
-    t, x, p = f.sx_in()
-    y = f(t, x, p)
-    sizes = ca.sqrt(ca.reshape(y[m:], m, -1) ** 2 @ (1 + ca.fabs(x)) ** 2)
-    off = ca.fabs(y[:m]) / ca.if_else(sizes > 0, sizes, 1)
-    largest = ca.densify(reduce(ca.fmax, off.elements(), ca.SX(0)))
-    return compiled(ca.Function("off_manifold", [t, x, p], [largest]), "off_manifold")
+
+    def largest(x, _, y):
+        sizes = ca.sqrt(ca.reshape(y[m:], m, -1) ** 2 @ (1 + ca.fabs(x)) ** 2)
+        off = ca.fabs(y[:m]) / ca.if_else(sizes > 0, sizes, 1)
+        return reduce(ca.fmax, off.elements(), ca.SX(0))
+
+    return compiled(combined("off_manifold", largest, f), "off_manifold")
 
 
 def _source(f, off_manifold, n_x):

@@ -234,7 +234,7 @@ class Monitor:
     def gradients(self):
         """Sizes of the invariants' gradients at the start, (m,)."""
         t, x = self.start
-        jacobian = self.invariants(t, x, self.model.parameters)[self.m :].reshape(len(x), self.m).T
+        jacobian = self.invariants(t, x, self.model.p)[self.m :].reshape(len(x), self.m).T
         sizes = motion_sizes(self.model, np.array([t, t + 1.0]), np.column_stack([x, x]))
         sizes = np.where(sizes > 0, sizes, 1.0) + np.abs(x)
         return np.maximum(np.sqrt((jacobian**2 * sizes**2).sum(axis=1)), 1e-300)
@@ -245,7 +245,7 @@ class Monitor:
         That is the largest entry in rows scaled by their columns with inertia; where all of it is zero, the size at the
         points at which ranks were decided.
         """
-        inertia = self.f(t, x, self.model.parameters)[-self.model.n :]
+        inertia = self.f(t, x, self.model.p)[-self.model.n :]
         metric = np.sqrt(np.where(inertia > 0, inertia, 0.0))
         moves, result = metric > 0, []
         if moves.all():
@@ -272,7 +272,7 @@ class Monitor:
 
     def _matrices(self, t, x):
         n = self.model.n
-        y = self.f(t, x, self.model.parameters)
+        y = self.f(t, x, self.model.p)
         rows = len(self.l_names)
         return y[: rows * n].reshape(n, rows).T, y[rows * n : -n].reshape(n, len(self.b_names)).T
 
@@ -467,7 +467,7 @@ class Monitor:
 
     def _hides(self, t, x):
         """Below which the residual at a state may hide a zero."""
-        values = self.invariants(t, x, self.model.parameters)[: self.m]
+        values = self.invariants(t, x, self.model.p)[: self.m]
         residual = np.abs(values / self.gradients).max(initial=0.0)  # relative to the gradients at the start
         return max(NEGLIGIBLE, HIDES * np.sqrt(residual))
 

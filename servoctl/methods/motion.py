@@ -250,7 +250,7 @@ class Stepping:
     def _use(self, model):
         poles = isinstance(self.drift, Poles)
         self.model, self.f, self.n_x = model, self._function(model, poles), len(model.state_names)
-        self.p = np.append(model.parameters, self.drift.coefficients(model)) if poles else model.parameters
+        self.p = np.append(model.p, self.drift.coefficients(model)) if poles else model.p
 
     def _function(self, model, poles):
         """The compiled X' and pivots."""
@@ -338,7 +338,7 @@ class Stepping:
         """The jets (n_z, N) at times t (N,) and states x (n_x, N)."""
         poles = isinstance(self.drift, Poles)
         f = self.model.function("ode_poles" if poles else "ode")
-        p = self.p if poles else self.model.parameters
+        p = self.p if poles else self.model.p
         return np.concatenate([x, f.grid(t, x, p)[self.n_x - self.model.n : self.n_x]])
 
     def _smooth(self, stretch):

@@ -10,6 +10,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.jets.branches import steep_arguments
+from servoctl.spec.references import function_of
 
 BESIDE_ZERO = 0.7  # change of an argument from its zero, at which odd functions of it are large, such as s exp(-s²)
 SECANTS, MOST_SECANTS = 4, 60  # of a zero between two instants, least and most
@@ -24,8 +25,8 @@ def arguments(model):
         moving, m = steep(model), model.reduction.mechanism
         if not moving:
             return None
-        inputs = [m.q.t, _state(model), ca.vertcat(*m.parameters.symbols)]
-        return compiled(ca.Function("steep", inputs, [ca.densify(ca.vertcat(*moving))]), "steep")
+        p, names = ca.vertcat(*m.parameters.symbols), model.reduction.references
+        return compiled(function_of(m.q, names, "steep", _state(model), p, ca.densify(ca.vertcat(*moving))), "steep")
 
     return model.once("steep arguments", build)
 

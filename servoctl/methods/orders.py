@@ -8,7 +8,7 @@ from servoctl.reduction.orders import other_order
 def end_where_orders_change(motion):
     """Cut a motion in place before the first sample at which a row has another order, and set the error as its stop."""
     for model, t, jets in motion.by_piece():
-        k, name = model.reduction.orders.first_change(t, jets, model.parameters)
+        k, name = model.reduction.orders.first_change(model.instants(t), jets, model.parameters)
         if k is not None:
             motion.end_before(t[k], _other_order(model, name, float(t[k]), jets[:, k]))
             return

@@ -24,7 +24,7 @@ def motion_sizes(model, t, x):
     coordinate at rest has of it is rounding. Coordinates without inertia, and q of another frame than γ', have their
     own largest magnitude. The motion is x (n_x, N) at t (N,) [s].
     """
-    inertia = model.function("matrices")(t[0], x[:, 0], model.parameters)[-model.n :]
+    inertia = model.function("matrices")(t[0], x[:, 0], model.p)[-model.n :]
     return sizes_of(model, inertia, np.abs(x).max(axis=1), t[-1] - t[0])
 
 

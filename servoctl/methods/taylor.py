@@ -15,6 +15,7 @@ import numpy as np
 
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.interpreted import weighted
+from servoctl.codegen.paths import BY_INSTANT
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.jets.tape import Tape
@@ -140,6 +141,9 @@ class _Motion(Motion):
 
     def velocity(self, i, level, j):
         return shifted(self.gamma[level + j][i], level, j)
+
+    def reference(self, i, level, j):
+        return self.q.family.jet(self.q.family.names[i], level + j) / factorial(j)
 
 
 class _Rows:
@@ -293,7 +297,7 @@ def _coefficients(equations, coordinates, gamma, last, instant, finished=list):
     coefficients = [] if equations.q.plain else [ca.SX(c) for k in range(1, last + 1) for c in coordinates[k]]
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
     outputs = finished([*coefficients, *(g for _, g in equations.pivots)])
-    return equations.function("taylor", equations.state, outputs, instant)
+    return equations.function("taylor", equations.state, outputs, instant, BY_INSTANT)
 
 
 def settled(equations):
@@ -303,7 +307,8 @@ def settled(equations):
     """
     rows = _by_rows(equations, equations.top)
     gamma = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top + 1) for c in rows.motion.gamma[k]]
-    return equations.function("settled", equations.state, rows.by_rows([*equations.q, *gamma]), rows.motion.branch)
+    outputs = rows.by_rows([*equations.q, *gamma])
+    return equations.function("settled", equations.state, outputs, rows.motion.branch, BY_INSTANT)
 
 
 def series_loop(model, last):
@@ -367,7 +372,7 @@ def leave_if_stiff(steps, method, limit, t, x):
     step = abs(t[-1] - t[0]) / (len(t) - 1)
     if method is None or abs(steps.watch.span) < STIFF_STEPS * step:
         return
-    jacobian = steps.model.function("ode_jacobian")(t[-1], x, steps.model.parameters).reshape(len(x), len(x))
+    jacobian = steps.model.function("ode_jacobian")(t[-1], x, steps.model.p).reshape(len(x), len(x))
     decay = np.linalg.eigvals(jacobian * np.sign(t[-1] - t[0])) if np.isfinite(jacobian).all() else np.zeros(1)
     fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
     if LIMITED * step * fastest > limit:
@@ -393,7 +398,7 @@ class TaylorSteps(Stepping):
         super().__init__(model, "Taylor", drift, progress)
 
     def _use(self, model):
-        self.model, self.n_x, self.p = model, len(model.state_names), np.append(model.parameters, np.nan)
+        self.model, self.n_x, self.p = model, len(model.state_names), np.append(model.p, np.nan)
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
@@ -415,14 +420,14 @@ class TaylorSteps(Stepping):
             return False
         _, *ends = breakpoints((t0, t1), knots)
         to_knot = len(knots) > 0 and np.abs(np.subtract(knots, t1)).min() <= margin_at(t1, (t0, t1))
-        p, net = np.append(model.parameters, np.nan), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT), to_knot)
+        p, net = np.append(model.p, np.nan), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT), to_knot)
         task, judged = (t0, x0, ends if len(ends) > 1 else float(t1)), resolved(*self.tolerances)
         whole = self.f.whole(task, p, self.tolerances, self.most, t_eval, net, judged)
         if whole is None or whole[0] == self.most:
             return False
         steps, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
         if "settled" not in self.f.others:
-            top = self.rates.grid(t_eval, jets[: self.n_x], model.parameters)[self.n_x - self.n : self.n_x]
+            top = self.rates.grid(t_eval, jets[: self.n_x], model.p)[self.n_x - self.n : self.n_x]
             off = np.abs(top - jets[-self.n :])[:, ~np.isin(t_eval, [*ends[:-1], t1] if to_knot else ends[:-1])]
             farthest, jets[-self.n :] = np.maximum(farthest, off.max(axis=1, initial=0.0)), top
         if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(farthest).all():
@@ -529,7 +534,7 @@ class TaylorSteps(Stepping):
             return 0
         k, at = self._instants(log)
         jets = log.jets(k, at, self.top)
-        rates = self.rates.grid(at, jets[: self.n_x], self.model.parameters)[self.n_x - n : self.n_x]
+        rates = self.rates.grid(at, jets[: self.n_x], self.model.p)[self.n_x - n : self.n_x]
         off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
         rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
         h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
@@ -579,7 +584,7 @@ class TaylorSteps(Stepping):
             def dense(s):
                 return log.jets(steps_of(t, s), s, self.top - 1)
 
-            more = centres(steep, self.model.parameters, parts[0], dense(parts[0]), dense)
+            more = centres(steep, self.model.p, parts[0], dense(parts[0]), dense)
             k, at = np.append(k, steps_of(t, more)), np.append(at, more)
         within = at != t[k]
         if self.knots:  # where paths have other branches
@@ -613,7 +618,7 @@ class TaylorSteps(Stepping):
             parts = log.jets(steps_of(t, times), times, max(jets, self.top - (not by_rows)), by_rows)
             x, top = parts[: self.n_x], parts[self.n_x :]
             if not len(top) or self.doubted:  # more accurate than as a derivative of the series
-                rates = self.rates.grid(times, x, self.model.parameters)[self.n_x - self.n : self.n_x]
+                rates = self.rates.grid(times, x, self.model.p)[self.n_x - self.n : self.n_x]
                 top = np.concatenate([rates, top[self.n :]])
             self.motion.add(self.model, times, x, top)
         return pending[~due]

@@ -83,7 +83,7 @@ def _call(state, model, later):
         except ServoError:
             continue
         f = model.signals("actuation")[1]
-        forces = f.grid([state.t], with_highest(model, [state.t], x)[: f.n_x], model.parameters)[:, 0]
+        forces = f.grid([state.t], with_highest(model, [state.t], x)[: f.n_x], model.p)[:, 0]
         if (np.abs(forces) <= later).all():
             values = [f"t={state.t:g}"] * bool(state.t) + [f"{name}={value}" for name, value in held.items()]
             return f"model.start({', '.join([*values, *[f'guess={guess}'] * bool(guess)])})"

@@ -11,10 +11,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import evaluated
 from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges, size_of_terms
 from servoctl.methods.sizes import state_levels
 from servoctl.model.equations import invariant_names
+from servoctl.spec.references import function_of
 from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
@@ -244,14 +246,14 @@ class Residuals:
 
     def values(self, t, x):
         """Residuals (m, N) at times t (N,) and states x (n_x, N), and what their tolerances and terms allow."""
-        y = self.f.grid(t, x, self.model.parameters)
+        y = self.f.grid(t, x, self.model.p)
         slopes = y[self.m :].reshape(len(x), self.m, -1).swapaxes(0, 1)
         allowed = LEAVES * self.tolerance.of(slopes, x)
         if self.first is None:
             self.first = allowed[:, 0]
         first, self.latest, self.bound = self.first[:, None], self.terms, np.inf
         if not np.all(allowed < SENSITIVE * first):  # near the edge of a domain slopes, and errors, grow without bound
-            terms = np.nan_to_num(self._terms.grid(t, x, self.model.parameters), posinf=0.0)
+            terms = np.nan_to_num(self._terms.grid(t, x, self.model.p), posinf=0.0)
             terms = np.maximum.accumulate(np.maximum(terms, self.terms[:, None]), axis=1)
             allowed, self.latest = np.fmin(allowed, np.maximum(first, OF_TERMS * terms)), terms[:, -1]
             self.bound = np.maximum(first, OF_TERMS * terms)
@@ -262,7 +264,7 @@ class Residuals:
 
         This needs no slopes.
         """
-        residuals = self.f.grid(t, x, self.model.parameters)[: self.m]
+        residuals = self.f.grid(t, x, self.model.p)[: self.m]
         return bool(np.all(np.abs(residuals) <= self.first[:, None]))
 
     @property
@@ -338,8 +340,8 @@ def edge(model, t, x):
     if not places:
         return "", ""
     arguments = ca.vertcat(*(argument for _, _, argument, _ in places))
-    f = ca.Function("arguments", [m.q.t, state, ca.vertcat(*m.parameters.symbols)], [arguments])
-    values = np.array(f(t, x, model.parameters)).ravel()
+    f = function_of(m.q, r.references, "edges", state, ca.vertcat(*m.parameters.symbols), arguments)
+    values = evaluated(f, t, x, model.p)
     near = [(abs(v - bound), words, row) for v, (row, words, _, bound) in zip(values, places, strict=True)]
     distance, words, row = min(near, key=lambda place: np.nan_to_num(place[0], nan=np.inf))
     return (words, row) if distance < EDGE else ("", "")

@@ -5,6 +5,7 @@ from functools import cached_property, reduce
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen.paths import combined
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import cse, size_of_terms
 from servoctl.model import saddle
@@ -12,16 +13,18 @@ from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate
 from servoctl.reduction.rows import row_levels
 from servoctl.spec.coordinates import jet_name
+from servoctl.spec.references import function_of
 
 
 class Invariants:
     """Invariants of the state X = (q, γ', ..., γ^(s̄-1)): the rows and those of their derivatives without γ^(s̄).
 
     `top` is s̄. Pivots are chosen at `points` of the manifold of the rows; a `cascade` has the rows by blocks.
+    `references` are names of those that the model follows.
     """
 
-    def __init__(self, mechanism, rows, top, points, cascade=None):
-        self.mechanism, self.rows, self.top, self.points = mechanism, rows, top, points
+    def __init__(self, mechanism, rows, top, points, cascade=None, references=()):
+        self.mechanism, self.rows, self.top, self.points, self.references = mechanism, rows, top, points, references
         self.cascade, self._motions = cascade, {}
         q = self.q = mechanism.q
         self.state = ca.vertcat(*q, *(s for k in range(1, top) for s in q.gamma(k)))
@@ -44,11 +47,11 @@ class Invariants:
             self._motions[given, correct] = self.cascade.along(self.points, given, max(given, self.top), correct)
         return self._motions[given, correct]
 
-    def function(self, name, x, outputs, extra=None):
-        """An SX function of (t, x, p) with one dense column."""
+    def function(self, name, x, outputs, extra=None, jets="r"):
+        """An SX function of (t, x, p) with one dense column; see `references.function_of`."""
         p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
         y = ca.densify(cse(ca.vertcat(*outputs)))
-        return ca.Function(name, [self.q.t, x, p], [y], ["t", "x", "p"], ["y"])
+        return function_of(self.q, self.references, name, x, p, y, jets=jets)
 
     @cached_property
     def invariant_rows(self):
@@ -101,8 +104,8 @@ class Equations(Invariants):
     """Expressions of a reduction, in the state X and the jets Z = (X, γ^(s̄))."""
 
     def __init__(self, reduction):
-        super().__init__(reduction.mechanism, reduction.rows, reduction.top, reduction.points, reduction.cascade)
-        self.r = reduction
+        r = self.r = reduction
+        super().__init__(r.mechanism, r.rows, r.top, r.points, r.cascade, r.references)
         self.jets = ca.vertcat(self.state, *self.q.gamma(self.top))
         self.coefficients = [
             [ca.SX.sym(f"c{a}_{j}") for j in range(count)] for a, count in enumerate(self.raised)
@@ -215,13 +218,11 @@ class Equations(Invariants):
     def ode_jacobian(self, poles=False):
         """∂X'/∂X, column by column, with the inputs of `ode`."""
         f = self.ode(poles)
-        p = ca.SX.sym("p", f.numel_in(2))
-        rates = f(self.q.t, self.state, p)[: self.state.numel()]
-        return ca.Function(
-            f"{f.name()}_jacobian",
-            [self.q.t, self.state, p],
-            [ca.densify(cse(ca.vec(ca.densify(ca.jacobian(rates, self.state)))))],
-        )
+
+        def slopes(x, _, y):
+            return cse(ca.vec(ca.densify(ca.jacobian(y[: x.numel()], x))))
+
+        return combined(f"{f.name()}_jacobian", slopes, f)
 
     def path(self):
         """For flat programs: outputs (δq, q', q'', pivots) as functions of (t, q), δq a Newton step.

@@ -24,7 +24,7 @@ def with_highest(model, t, states, p=None):
 
     The parameters are (n_p,) or (n_p, N); default: those of the model.
     """
-    (n_x, n), p = (len(model.state_names), model.n), model.parameters if p is None else p
+    (n_x, n), p = (len(model.state_names), model.n), model.p if p is None else p
     if not model.flat:
         return np.concatenate([states, model.function("ode").grid(t, states, p)[n_x - n : n_x]])
     nq, path = model.nq, model.function("path")
@@ -42,12 +42,13 @@ def extended(model, t, jets, size):
     scale = np.repeat([1.0, *(factorial(k) for k in range(1, level + 1))], [q.nq, *level * [q.n]])[:, None]
     z = np.zeros((size, len(t)), dtype=REAL)
     z[: len(jets)] = jets / scale[: len(jets)]
-    points = replace(r.points, t=np.asarray(t), z=z, values=model.parameters, residual=np.zeros(len(t)))
+    instants = model.instants(t)
+    points = replace(r.points, instants=instants, z=z, values=model.parameters, residual=np.zeros(len(t)))
     if r.cascade is not None:
         deeper, good = r.cascade.continued(points, level, r.top - 1)
         solved = deeper[:size]
     else:
-        solved, residual = solve(Flow(q, r.rows, level, points), t, z)
+        solved, residual = solve(Flow(q, r.rows, level, points), instants, z)
         good = residual < ON_MANIFOLD
     result = np.where(good, (solved * scale).astype(float), np.nan)
     result[: len(jets)] = jets

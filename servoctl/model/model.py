@@ -4,13 +4,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from math import factorial
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import MOST_JETS, as_numbers, by_name, finite, named, whole
 from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import Followed
 from servoctl.errors import ServoError, SpecificationError
+from servoctl.jets.tape import JETS, REAL
 from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
 from servoctl.model.jets import jet_names_to
@@ -24,10 +27,12 @@ from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
+from servoctl.reduction.manifold import jet_of_reference
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
+from servoctl.spec.references import followed_path
 from servoctl.values import evenly, read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
@@ -139,8 +144,9 @@ class Model(Detailed):
         Names of the jets Z = (X, γ^(s̄)).
     """
 
-    def __init__(self, reduction, store, values=None, knots=None, functions=None, variants=None):
+    def __init__(self, reduction, store, values=None, knots=None, functions=None, variants=None, paths=None):
         q = reduction.mechanism.q
+        self.paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
         self.reduction, self._store = reduction, store
         self.parameters = read_only(reduction.context.values.copy() if values is None else values)
         self._knots = reduction.knots if knots is None else knots
@@ -170,7 +176,7 @@ class Model(Detailed):
 
     def __reduce__(self):
         mechanism, _, *choices = self._store.specification
-        return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self._knots)
+        return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self._knots, self.paths)
 
     def with_parameters(self, **changes: float) -> "Model":
         """The same model with other parameters.
@@ -202,7 +208,69 @@ class Model(Detailed):
             if not self._holds(values):
                 self._store.require_unchanged()
                 return self._of(r.mechanism, r.program, r.context.guess, None, values)
-        return Model(r, self._store, values, require_smooth(r.switches, values, r.smoothness), self._functions)
+        knots = require_smooth(r.switches, values, r.smoothness)
+        return Model(r, self._store, values, knots, self._functions, paths=self.paths)
+
+    def with_references(self, **paths) -> "Model":
+        """The same model along other paths: nothing is derived, and nothing compiled.
+
+        Parameters
+        ----------
+        **paths : Path
+            Of one component each, by the names of the references; what SciPy makes is one, too.
+
+        Returns
+        -------
+        Model
+
+        Raises
+        ------
+        NameUnknown
+            For a name that is no reference.
+        SpecificationError
+            For what is no path of one component.
+        """
+        changes = by_name(paths, self.paths, "reference", "The references")
+        paths = self.paths | {name: followed_path(name, path) for name, path in changes.items()}
+        return Model(self.reduction, self._store, self.parameters, self._knots, self._functions, paths=paths)
+
+    def _with(self, other, functions, variants=None):
+        """The reduction of another model with the numbers and paths of this one."""
+        return Model(other.reduction, other._store, self.parameters, self._knots, functions, variants, self.paths)
+
+    @cached_property
+    def _followed(self):
+        if missing := [name for name, path in self.paths.items() if path is None]:
+            raise SpecificationError(
+                f"No path was given for {', '.join(missing)}.",
+                "A motion follows a path for each reference of the program.",
+                do=f"Write model.with_references({', '.join(f'{name}=...' for name in missing)}).",
+                missing=missing,
+            )
+        return Followed([(path, 0) for path in self.paths.values()])
+
+    @cached_property
+    def p(self):
+        """The parameters of compiled functions: those of the model, after the place of the paths that it follows."""
+        return read_only(np.append(self._followed.address, self.parameters)) if self.paths else self.parameters
+
+    def instants(self, t):
+        """Instants (N, 1 + R) of times (N,) [s]: with the jets of the paths that are followed there."""
+        family = self.reduction.mechanism.q.family
+        result = np.zeros((len(t), len(family), JETS + 1), dtype=REAL)
+        for name, path in self.paths.items() if len(t) else ():
+            order = min(JETS, path.coefficients.shape[2] - 1)
+            sizes = np.array([[factorial(k)] for k in range(order + 1)], dtype=float)
+            result[:, family.names.index(name), : order + 1] = (path.jets(t, order)[:, 0] / sizes).T
+        return np.column_stack([np.asarray(t, dtype=REAL), result.reshape(len(t), -1)])
+
+    def references_at(self, t):
+        """Derivatives of the references at an instant, by names as points near a state have them."""
+        found = {}
+        for name, path in self.paths.items():
+            jets = path.jets([t], path.coefficients.shape[2] - 1)[:, 0, 0]
+            found |= {jet_of_reference(name, k): value for k, value in enumerate(jets.tolist()[: JETS + 1])}
+        return found
 
     def _holds(self, values):
         """Whether every decision of the derivation is the same with other parameters."""
@@ -381,13 +449,13 @@ class Model(Detailed):
             return self.once("structure", lambda: structure(self.reduction, start=self._default_start()))
         model = including(self, names_of(motion))
         t, jets = _samples(model, motion, jets)
-        return structure(model.reduction, t, jets, model.parameters)
+        return structure(model.reduction, model.instants(t), jets, model.parameters)
 
     def _default_start(self):
-        """The time and the values of the start without held or guessed values; None if there is none."""
+        """The instant and the values of the start without held or guessed values; None if there is none."""
         with suppress(ServoError):
             start = default_start(self)
-            return start.t, start.values
+            return self.instants([start.t]), start.values
 
     def _lines(self, full):
         return describe(self, full)
@@ -415,9 +483,8 @@ def _samples(model, motion, jets):
     return t, jets
 
 
-def _unpickled(mechanism, content, choices, parameters, knots):
+def _unpickled(mechanism, content, choices, parameters, knots, paths):
     reduction = unpack(content, mechanism)
     store = Store(mechanism, reduction.program, *choices)
-    model = Model(reduction, store, parameters, knots)
     form = form_of(reduction)
-    return Model(reduction, store.part(form), parameters, knots) if form else model
+    return Model(reduction, store.part(form) if form else store, parameters, knots, paths=paths)

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import mapping
+from servoctl.codegen.paths import evaluated
 from servoctl.errors import InconsistentStart, ServoError, SingularProgram
 from servoctl.jets.branches import shown
 from servoctl.model.equations import gradient_jets, invariant_names
@@ -17,6 +18,7 @@ from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, c
 from servoctl.model.variants import derived_near
 from servoctl.progress import stage
 from servoctl.reduction.ranks import equilibrate
+from servoctl.spec.references import function_of
 from servoctl.tolerances import RESOLVED
 from servoctl.values import frozen
 
@@ -142,7 +144,8 @@ def _divisors(model, variant, t, x):
     divisors = [(hidden[name], pivot) for name, pivot in variant.reduction.pivots if name in hidden]
     if not divisors:
         return [], np.zeros(0)
-    there = usual.at([t], np.append(x[: len(model.state_names)], np.zeros(model.n))[:, None], model.parameters)
+    jets = np.append(x[: len(model.state_names)], np.zeros(model.n))[:, None]
+    there = usual.at(model.instants([t]), jets, model.parameters)
     sizes = (np.abs(points.evaluate([pivot for _, pivot in divisors])[0]).max(axis=1) for points in (there, usual))
     with np.errstate(all="ignore"):
         return divisors, np.divide(*sizes)
@@ -308,7 +311,7 @@ def _moves(model, t, guess, still):
 
 def _state_rates(model, t, x):
     """q' (nq,) at a state, also where velocities are others."""
-    q, parameters = model.reduction.mechanism.q, ca.vertcat(*model.reduction.mechanism.parameters.symbols)
-    arguments = q.t, q.jet(0), q.jet(1), parameters
-    rates = model.once("rates of coordinates", lambda: ca.Function("rates", arguments, [ca.vertcat(*q.d(1))]))
-    return np.ravel(rates(t, x[: q.nq], x[q.nq : q.nq + q.n], model.parameters))
+    r, q = model.reduction, model.reduction.mechanism.q
+    of, p = ca.vertcat(q.jet(0), q.jet(1)), ca.vertcat(*r.mechanism.parameters.symbols)
+    rates = model.once("rates", lambda: function_of(q, r.references, "rates", of, p, ca.vertcat(*q.d(1))))
+    return evaluated(rates, t, x[: q.nq + q.n], model.p)

@@ -9,7 +9,9 @@ with the smallest angles, as the zero of a length means nothing; then the one in
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen.paths import arguments
 from servoctl.reduction.rows import Row
+from servoctl.spec.references import function_of
 from servoctl.tolerances import ENTRY, TINY
 
 NEWTON = 25  # steps
@@ -26,7 +28,7 @@ class Rests:
     p are the numbers of the mechanism's parameters, z = [q; μ].
     """
 
-    def __init__(self, mechanism, balance, B, rows):
+    def __init__(self, mechanism, balance, B, rows, references=()):
         q = mechanism.q
         rows = {name: e for name, e in (rows | mechanism.followers).items() if q.order(e) <= 0}
         self.coordinates, self.nq, self.n = q.names, q.nq, q.n
@@ -38,14 +40,16 @@ class Rests:
         moving = {f"rate of {name}": h for name, h in zip(q.names, q.h.elements(), strict=True) if not h.is_zero()}
         rows = ca.vertcat(still, *q.invariants.values(), *moving.values())
         self.names += (*q.invariants, *moving)
-        self.function = ca.Function("rest", [q.t, z, p], [ca.densify(rows), ca.densify(ca.jacobian(rows, z))])
-        self._frame = frame(mechanism)
+        parts = map(ca.densify, (rows, ca.jacobian(rows, z)))
+        self.function = function_of(q, references, "rest", z, p, *parts)
+        self._frame = frame(mechanism, references)
 
     @classmethod
     def of_model(cls, model):
         """Those under the balance and the actuation of a model."""
         r = model.reduction
-        return cls(r.mechanism, r.balance, r.realisation.B, {row.name: row.expression for row in r.original.values()})
+        rows = {row.name: row.expression for row in r.original.values()}
+        return cls(r.mechanism, r.balance, r.realisation.B, rows, r.references)
 
     @classmethod
     def of_program(cls, mechanism, forces, program):
@@ -58,7 +62,7 @@ class Rests:
 
     def measured(self, t, z, p):
         """The rows (e,) at [q; μ], their slopes (e, z) and the rows relative to these and to the state."""
-        rows, slopes = (np.array(part) for part in self.function(t, z, p))
+        rows, slopes = (np.array(part) for part in self.function(*arguments(self.function, t, z, p)))
         return rows[:, 0], slopes, np.abs(rows[:, 0]) / np.maximum(np.abs(slopes) @ (1.0 + np.abs(z)), TINY)
 
     def reached(self, t, p, q, movable=None, weights=None, some=slice(None), angles=None):
@@ -149,7 +153,7 @@ class Rests:
 
     def _met(self, t, p, q, known, movable, angles, sizes):
         """q on the constraints and the program by what nobody guessed, driven lengths first, at last by anything."""
-        V, _, E = (np.array(part) for part in self._frame(t, q, p))
+        V, _, E = (np.array(part) for part in self._frame(*arguments(self._frame, t, q, p)))
         driven, lengths, first = np.abs(V @ E).max(axis=1, initial=0.0) > 0, ~angles, q
         for some in (driven & lengths & ~known, lengths & ~known, driven & ~known, ~known, movable):
             near = q if some is movable else first
@@ -178,21 +182,21 @@ class Rests:
         way, works = (other - one)[: self.nq], []
         for at, weight in zip(*np.polynomial.legendre.leggauss(NEWTON // 2), strict=True):
             z = np.concatenate([one[: self.nq] + 0.5 * (1 + at) * way, np.zeros(len(one) - self.nq)])
-            V = np.array(self._frame(t, z[: self.nq], p)[0])
+            V = np.array(self._frame(*arguments(self._frame, t, z[: self.nq], p))[0])
             works.append(0.5 * weight * (self.measured(t, z, p)[0][: self.n] * (np.linalg.pinv(V) @ way)))
         return np.sum(works), np.abs(works).sum()
 
 
-def frame(mechanism):
+def frame(mechanism, references):
     """V, the inertia and the directions of the actuators at rest, a CasADi function of t, q and parameters."""
     q, p = mechanism.q, ca.vertcat(*mechanism.parameters.symbols)
     parts = [ca.densify(_still(q, e)) for e in (ca.SX(q.V), mechanism.mass, mechanism.E)]
-    return ca.Function("frame", [q.t, q.jet(0), p], parts)
+    return function_of(q, references, "frame", q.jet(0), p, *parts)
 
 
 def roots_of_inertia(frame, t, q, p):
     """The roots of the inertias of coordinates and of velocities at q (nq,), for want of inertia the least of them."""
-    V, M, _ = (np.array(part) for part in frame(t, q, p))
+    V, M, _ = (np.array(part) for part in frame(*arguments(frame, t, q, p)))
     inverse = np.linalg.pinv(V) if np.isfinite(V).all() else np.nan * V.T
     for inertia in (inverse.T @ M @ inverse, M):
         with np.errstate(all="ignore"):
@@ -209,5 +213,6 @@ def _smallest(values, size=0.0):
 
 def _still(q, expressions):
     """Expressions with all rates zero."""
-    rates = [s for s in ca.symvar(expressions) if (q.where(s) or ("t", 0, 0))[0] == "w"]
+    places = [(s, q.where(s) or ("t", 0, 0)) for s in ca.symvar(expressions)]
+    rates = [s for s, (kind, level, _) in places if kind == "w" or (kind == "r" and level > 0)]
     return ca.substitute(expressions, ca.vertcat(*rates), ca.SX.zeros(len(rates))) if rates else expressions

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import column, finite, mapping, named
+from servoctl.codegen.paths import evaluated
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants, invariant_names
@@ -15,6 +16,7 @@ from servoctl.model.jets import jet_names_to
 from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
 from servoctl.model.variants import derived_near, reordered_at, strong_near
 from servoctl.spec.mechanism import require_known
+from servoctl.spec.references import function_of
 from servoctl.values import Value, frozen
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
@@ -115,13 +117,13 @@ class JetEquations:
     """
 
     def __init__(self, model, t, conditions, rows=None):
-        r, self.t, self.p = model.reduction, t, model.parameters
+        r, self.t, self.p = model.reduction, t, model.p
         q = r.mechanism.q
         top = max([r.top, *(q.order(e) + 1 for e in conditions.values())])
         if top == r.top and rows is None:
             self.f, names = model.function("invariants"), [name for _, name in invariant_names(model)]
         else:
-            extended = Invariants(r.mechanism, rows or r.rows, top, r.points)
+            extended = Invariants(r.mechanism, rows or r.rows, top, r.points, references=r.references)
             self.f, names = _numeric(extended.invariants()), [name for _, name, _ in extended.invariant_rows]
         self.invariants, self.rows, self.conditions, self.kept = len(names), [*names, *conditions], None, slice(None)
         self.names = jet_names_to(model, q.nq + (top - 1) * q.n)
@@ -129,7 +131,7 @@ class JetEquations:
             jets, values = ca.vertcat(*(q.jet(k) for k in range(top))), ca.vertcat(*conditions.values())
             outputs = ca.densify(ca.vertcat(values, ca.vec(ca.jacobian(values, jets))))
             parameters = ca.vertcat(*r.mechanism.parameters.symbols)
-            self.conditions = _numeric(ca.Function("conditions", [q.t, jets, parameters], [outputs]))
+            self.conditions = _numeric(function_of(q, r.references, "conditions", jets, parameters, outputs))
 
     def __call__(self, x):
         """Values (m,) and Jacobian (m, n_z) at jets (n_z,)."""
@@ -165,7 +167,7 @@ def gradient_sizes(jacobian, x):
 
 def _numeric(f):
     """A CasADi function of columns as one of arrays."""
-    return lambda *x: f(*x).full().ravel()
+    return lambda t, x, p: evaluated(f, t, x, p)
 
 
 @frozen(eq=False)
@@ -192,8 +194,8 @@ class Aim:
 
     def weighed(self, model, t):
         """Distances of coordinates and of velocities by the kinetic energy, and so those of higher derivatives."""
-        measured = model.once("frame", lambda: frame(model.reduction.mechanism))
-        of_q, of_w = roots_of_inertia(measured, t, self.reference[: model.nq], model.parameters)
+        measured = model.once("frame", lambda: frame(model.reduction.mechanism, model.reduction.references))
+        of_q, of_w = roots_of_inertia(measured, t, self.reference[: model.nq], model.p)
         return replace(self, sizes=np.append(of_q, np.resize(of_w, len(self.names) - model.nq)))
 
 
@@ -233,7 +235,7 @@ def _notes(model, t, given, guess, state):
         yield f"the nearest state found is {far:.4g} off the guess: {name} = {shown:.4g}, guessed {guess[name]:.4g}"
     coordinates = {name: value for name, value in given.items() if name in model.reduction.mechanism.q.names}
     turned = {name: value for name, value in coordinates.items() if abs(value) > 2 * np.pi and value % 5 == 0}
-    angles = _all_rests(model).angles(t, model.parameters, np.zeros(model.nq)) if turned else ()
+    angles = _all_rests(model).angles(t, model.p, np.zeros(model.nq)) if turned else ()
     for name, value in turned.items():
         if angles[model.reduction.mechanism.q.names.index(name)]:
             yield f"{name} = {value:g} is in radians; {value:g} degrees are {np.radians(value):.4g}"
@@ -251,7 +253,7 @@ def _rests(model, equations, aim, held, conditions):
         return None
     chosen = zip(q.names, aim.reference, aim.guessed | ~aim.movable, strict=False)
     guess = {name: value for name, value, known in chosen if known}
-    found, _ = _all_rests(model).nearest(t, model.parameters, guess, held.keys() - rates)
+    found, _ = _all_rests(model).nearest(t, model.p, guess, held.keys() - rates)
     states = [np.concatenate([z[: q.nq], np.zeros(len(aim.names) - q.nq)]) for z in found]
     jets = np.append(states[0][: len(model.state_names)], np.zeros(model.n)) if states else None
     if states and not _largest(equations, states[0]) < TOLERANCE:
@@ -268,7 +270,7 @@ def _stays(model, t, x):
     """
     if model.flat:
         return True
-    rates, n_x, p = model.function("ode").expression, len(model.state_names), model.parameters
+    rates, n_x, p = model.function("ode").expression, len(model.state_names), model.p
     slow = STILL * (1.0 + np.abs(x[:n_x]))
 
     def largest(at, rate):
@@ -359,7 +361,7 @@ def _by_blocks(model, t, equations, aim):
     r, q, n_x = model.reduction, model.reduction.mechanism.q, len(model.state_names)
     sizes = np.repeat([1.0, *(factorial(k) for k in range(1, r.top))], [q.nq, *[q.n] * (r.top - 1)])
     z = (aim.reference[:n_x] / sizes)[:, None]
-    z, _ = r.cascade.continued(replace(r.points, t=np.array([t]), z=z, values=model.parameters), r.top)
+    z, _ = r.cascade.continued(replace(r.points, instants=model.instants([t]), z=z, values=model.parameters), r.top)
     x = aim.reference.copy()
     x[:n_x] = np.where(aim.movable[:n_x], z[:n_x, 0].astype(float) * sizes, x[:n_x])
     x = gauss_newton(equations, np.where(np.isfinite(x), x, aim.reference), aim)

@@ -12,6 +12,7 @@ from servoctl.model.equations import residual_names
 from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.parameters import Parameters
+from servoctl.spec.references import function_of
 
 MOST_TURNS = 16  # of a switch at one state, while those inside its switching function are settled
 
@@ -49,7 +50,8 @@ class Switching:
         functions = ca.vertcat(*(s.function for s in self.switches))
         others = ca.vertcat(*(s.other for s in self.switches))
         y = ca.densify(cse(ca.vertcat(functions, others, ca.vec(ca.densify(ca.jacobian(functions, state))))))
-        return compiled(ca.Function("switches", [q.t, state, ca.vertcat(*m.parameters.symbols)], [y]), "switches")
+        p, names = ca.vertcat(*m.parameters.symbols), self.model.reduction.references
+        return compiled(function_of(q, names, "switches", state, p, y), "switches")
 
     def values(self, branches, t, x):
         """Switching functions (S, N), their slopes in X (S, n_x, N), and the branches beyond their zeros (S, N).
@@ -58,7 +60,7 @@ class Switching:
         are right.
         """
         n = len(self.switches)
-        y = self._function.grid(t, x, np.append(self.model.parameters, branches))
+        y = self._function.grid(t, x, np.append(self.model.p, branches))
         return y[:n], y[2 * n :].reshape(len(x), n, -1).swapaxes(0, 1), y[n : 2 * n]
 
     def branches(self, t, x, known=None):

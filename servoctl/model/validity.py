@@ -79,9 +79,11 @@ def affirmed(model, values):
 
 def affirmed_each(model, values):
     """The same for each column of parameters (n_p, C), (C,) array of bool."""
-    known = model.once("quantities", lambda: quantities(model.equations))
     result, points = np.zeros(values.shape[1], bool), len(model.reduction.points.t)
-    if known.function is None or not points:
+    if model.paths or not points:  # points have jets of references of their own: extended precision decides
+        return result
+    known = model.once("quantities", lambda: quantities(model.equations))
+    if known.function is None:
         return result
     with np.errstate(all="ignore"):
         # from the manifold of the model's own parameters others are fewer steps away
@@ -116,8 +118,8 @@ def _of_invariants(model):
 
     def places():
         f = model.function("invariants").expression
-        t, x, p = f.sx_in()
-        return np.flatnonzero(ca.which_depends(f(t, x, p), p, 1, False)).tolist()
+        t, x, p, *r = f.sx_in()
+        return np.flatnonzero(ca.which_depends(f(t, x, p, *r), p, 1, False)).tolist()
 
     return model.once("parameters of the invariants", places)
 

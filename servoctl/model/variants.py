@@ -24,7 +24,8 @@ def derived_near(model, t, jets, sizes=()):
     default = model.once("jet sizes", lambda: model.equations.jet_sizes)
     model._store.require_unchanged()
     sizes = {name: size for name, size in dict(sizes).items() if size > ENTRY * default.get(name, 0.0)}
-    place = (float(t), dict(zip(model.jet_names, jets.tolist(), strict=True)), default | sizes)
+    state = dict(zip(model.jet_names, jets.tolist(), strict=True)) | model.references_at(t)
+    place = (float(t), state, default | sizes)
     key = repr(place)
     if key in model._variants:
         return model._variants[key]
@@ -38,8 +39,7 @@ def derived_near(model, t, jets, sizes=()):
             free=near.free,
             expected=model.free,
         )
-    numbers = model.parameters, model._knots, near._functions, model._variants
-    return _kept(model, key, type(model)(near.reduction, near._store, *numbers))
+    return _kept(model, key, model._with(near, near._functions, model._variants))
 
 
 def strong_near(model, t, jets):
@@ -59,6 +59,8 @@ def _near(model, place):
 def _near_before(model, t, jets, sizes):
     """The variant near an instant with the parameters of the derivation, if it serves with these; else None."""
     r = model.reduction
+    if model.paths:  # a variant belongs to the jets of its paths
+        return None
     same = np.array_equal(model.parameters, r.context.values)
     own = model if same else type(model)(r, model._store, functions=model._functions)
     first = model._functions.setdefault(AS_DERIVED, own)
@@ -68,7 +70,7 @@ def _near_before(model, t, jets, sizes):
         near = derived_near(first, t, jets, sizes)
     except ServoError:
         return None
-    here = type(model)(near.reduction, near._store, model.parameters, model._knots, near._functions)
+    here = model._with(near, near._functions)
     serves = pivot_strength(here, t, jets) > STRONG and (same or near._holds(model.parameters))
     return here if serves else None
 
@@ -89,7 +91,7 @@ def reordered_at(model, t, jets):
     if model.equations.definite or model.equations.sparse or (r.cascade is None and model.flat and model.nq != model.n):
         return None
     try:
-        order = r.order_at(float(t), np.asarray(jets, dtype=float), model.parameters)
+        order = r.order_at(model.instants([t]), np.asarray(jets, dtype=float), model.parameters)
     except SingularProgram:
         return None
     return None if order == r.order else _formed(model, order)
@@ -125,7 +127,8 @@ def _formed(model, form):
         return model._variants[key]
     reduction = definite(r) if form == DIAGONAL else r.with_order(form)
     store, functions = model._store.part(form), model._functions.setdefault(str(form), {})
-    made = reduction and type(model)(reduction, store, model.parameters, model._knots, functions, model._variants)
+    numbers = model.parameters, model._knots, functions, model._variants, model.paths
+    made = reduction and type(model)(reduction, store, *numbers)
     return _kept(model, key, made)
 
 

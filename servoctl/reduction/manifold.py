@@ -305,15 +305,16 @@ def sample(q, rows, level, context, starts=None, flow=None):
         q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book, context.scales
     )
     flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
-    first = _solved(starting, flow, slice(POINTS))
+    aim = context.followed is None
+    first = _solved(starting, flow, slice(POINTS), aim=aim)
     points = _with_inertia(first, context.saddle)
     if len(points) == POINTS:
         return points
-    others = _solved(starting, flow, slice(POINTS, None))
+    others = _solved(starting, flow, slice(POINTS, None), aim=aim)
     points = points.joined(_with_inertia(others, context.saddle)).take(slice(POINTS))
     if not len(points):  # as where every solution is in such a place
         points = first.joined(others).take(slice(POINTS))
-    return points if len(points) else _solved(starting, flow, slice(POINTS), natural=True)
+    return points if len(points) else _solved(starting, flow, slice(POINTS), natural=True, aim=aim)
 
 
 def _with_inertia(points, saddle):
@@ -349,13 +350,28 @@ def _random_starts(q, level, context):
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
     t = rng.uniform(*context.window, (2 * POINTS, 1))
     r = rng.uniform(-1.0, 1.0, (2 * POINTS, len(q.family) * (JETS + 1)))
+    r = r if context.followed is None else np.tile(context.followed, (2 * POINTS, 1))
     return np.hstack([t, r]).astype(REAL), z
 
 
-def _solved(starting, flow, some, natural=False):
+def follows(q, values):
+    """Jets (R,) of references, as in instants, by their values {"X_reference": ...}; those without are zero."""
+    jets = np.zeros((len(q.family), JETS + 1))
+    for i, name in enumerate(q.family.names):
+        for k in range(JETS + 1):
+            jets[i, k] = values.get(jet_of_reference(name, k), 0.0) / factorial(k)
+    return jets.ravel()
+
+
+def jet_of_reference(name, k):
+    """The name of a derivative of a reference among those of jets near which points are drawn."""
+    return f"d{k}{name}_reference"
+
+
+def _solved(starting, flow, some, natural=False, aim=True):
     """The points of the manifold to which Newton's method converges from some of the starting points."""
     instants, z = starting.instants[some], starting.z[:, some]
-    if 0 in flow.members:
+    if aim and 0 in flow.members:
         instants, z = aimed(flow.lowest, instants, z)
     z, residual = solve(flow, instants, z, natural=natural)
     points = replace(starting, instants=instants, z=z, residual=residual.astype(float))
@@ -390,5 +406,6 @@ class Context:
     spread: float = SPREAD  # relative width of the starts about guessed values
     sizes: dict = field(default_factory=dict)  # of jets by name, by which a guess near zero is spread; default `scales`
     scales: object = None  # Scales: usual sizes of jets, by which jets without a guess are spread; default 1 each
+    followed: object = None  # (R,) jets of references, as in instants, that points near a state have; default random
     book: Book = field(default_factory=Book, repr=False, compare=False)  # tapes of the scalars that were evaluated
     saddle: object = None  # SX [M G_mᵀ; G_m 0]: points where it is singular are left out, where there are others

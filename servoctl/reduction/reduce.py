@@ -15,7 +15,7 @@ from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.knots import Knots, Switches, require_smooth
-from servoctl.reduction.manifold import Context, Points, at_nominal_size, sample
+from servoctl.reduction.manifold import Context, Points, at_nominal_size, follows, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
@@ -25,6 +25,7 @@ from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
+from servoctl.spec.references import names_in
 from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
@@ -85,6 +86,11 @@ class Reduction(Packed):
         """Whether paths switch at some instants."""
         return bool(self.switches)
 
+    @cached_property
+    def references(self):
+        """Names of the references in the program and the mechanism."""
+        return references(self.mechanism, self.program)
+
     @property
     def hidden(self):
         """The rows that are hidden constraints."""
@@ -121,8 +127,8 @@ class Reduction(Packed):
         return eliminate(self.leading, right, clean(*self.points.matrix(self.leading)), order=self.order)
 
     def order_at(self, t, jets, values):
-        """Pivots of L, or of its blocks, chosen at jets (nz,) of an instant t [s], with these parameters."""
-        here = self.points.at(np.array([t]), jets[:, None], values)
+        """Pivots of L, or of its blocks, chosen at jets (nz,) of an instant t (1, 1 + R), with these parameters."""
+        here = self.points.at(t, jets[:, None], values)
         if self.cascade is not None:
             return self.cascade.order_at(here, self.top - 1 if self.free else 0, self.top)
         return pivot_order(self.leading, clean(*here.matrix(self.leading)))
@@ -232,6 +238,14 @@ def _reduced(mechanism, program, switches, balance, context):
     return Reduction(
         mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name, *cascade
     )
+
+
+def references(mechanism, program):
+    """Names of the references in the expressions of a specification."""
+    m, chosen = mechanism, (*program.weights.values(), *program.toward.values())
+    of_program = (*program.with_turns.values(), *(e for e in chosen if isinstance(e, ca.SX)))
+    named_rows = (*m.constraints.values(), *m.followers.values(), *m.outputs.values(), *m.reported.values())
+    return names_in(m.q, [*of_program, *named_rows, m.balance, m.energy, m.E, m.q.V, m.q.h])
 
 
 def holds(reduction, values):
@@ -349,7 +363,8 @@ def _context(mechanism, times, guess, near, values, scales=None):
         return Context(symbols, values, _window(times, unit), guess or {}, scales=scales)
     t, guess, sizes = near
     width = NEARBY * min(unit, _time_scale(mechanism.q, guess, scales))
-    return Context(symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes, scales)
+    followed = follows(mechanism.q, guess)
+    return Context(symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes, scales, followed)
 
 
 def _window(times, scale=1.0):

@@ -245,7 +245,8 @@ def structure(reduction, t=None, jets=None, values=None, start=None):
     points = reduction.points if t is None else points_of(reduction, t, jets, values)
     locals_ = _locals(reduction, points, t is not None)
     if start is not None:
-        start = start[0], _locals(reduction, points_of(reduction, [start[0]], start[1][:, None], values), True)[0]
+        t0, state = start
+        start = float(t0[0, 0]), _locals(reduction, points_of(reduction, t0, state[:, None], values), True)[0]
     typical = _most_common(locals_)
     if t is not None:
         locals_ = _without_rounded(locals_, typical, margins(reduction, t, jets, values))

@@ -99,3 +99,29 @@ class Family:
     def where(self, key):
         """("r", k, place) of a symbol by its element hash, or None."""
         return self._places.get(key)
+
+
+def names_in(q, expressions):
+    """Names of the references in SX expressions, in the order in which they were made, a tuple of str."""
+    symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *map(ca.vec, expressions))) if len(q.family) else []
+    places = {place[2] for place in map(q.where, symbols) if place and place[0] == "r"}
+    return tuple(name for i, name in enumerate(q.family.names) if i in places)
+
+
+def function_of(q, names, name, x, p, *outputs, jets="r"):
+    """An SX function (t, x, p) of expressions, or (t, x, p, r) where they contain jets of references.
+
+    `names` are those of the references that a model follows: where there are some, p begins with the place of their
+    paths in memory. The fourth input r has their derivatives 0 .. K in columns; `jets` is its name (`codegen.paths`).
+    """
+    p, outputs = ca.vertcat(ca.SX.sym("paths"), p) if names else p, [ca.SX(y) for y in outputs]
+    symbols = ca.symvar(ca.vertcat(*map(ca.vec, outputs))) if names else []
+    levels = [place[1] for place in map(q.where, symbols) if place and place[0] == "r"]
+    r = [ca.vertcat(*(q.family.jet(one, k) for one in names)) for k in range(max(levels, default=-1) + 1)]
+    inputs = {"t": q.t, "x": x, "p": p} | ({jets: ca.horzcat(*r)} if r else {})
+    return ca.Function(name, [*inputs.values()], outputs, [*inputs], [f"y{i or ''}" for i in range(len(outputs))])
+
+
+def followed_path(name, path):
+    """The path of one component that a reference follows."""
+    return path

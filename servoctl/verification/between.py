@@ -3,10 +3,10 @@
 import functools
 from dataclasses import field
 
-import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import combined
 from servoctl.values import frozen
 
 STAGES = 4  # Gauss points of a step: order 8
@@ -42,7 +42,7 @@ class Flow:
 
     def values(self, t, x):
         """Rates (n_x, N) and jets (n_z, N) at states (n_x, N)."""
-        y, (nq, n) = self.f.grid(t, x, self.model.parameters), (self.model.nq, self.model.n)
+        y, (nq, n) = self.f.grid(t, x, self.model.p), (self.model.nq, self.model.n)
         if self.flat:
             first = nq if self.model.reduction.mechanism.q.plain else 3 * nq  # of γ' and γ'' (see `Equations.path`)
             return y[nq : 2 * nq], np.concatenate([x, y[first : first + 2 * n]])
@@ -50,7 +50,7 @@ class Flow:
 
     def newton(self, t, x):
         """The Newton step (n_x, N) that leads states back to the constraints; none where the states are integrated."""
-        return self.f.grid(t, x, self.model.parameters)[: len(x)] if self.flat else np.zeros_like(x)
+        return self.f.grid(t, x, self.model.p)[: len(x)] if self.flat else np.zeros_like(x)
 
     def settled(self, t, x):
         """States led back to the constraints by Newton's method."""
@@ -64,15 +64,14 @@ class Flow:
             return np.zeros(len(t))
         work = self.model.once("power of forces", lambda: _power_of_forces(self.model))
         values = np.empty((1, len(t)))
-        work.interpreted.grid(t, z[: work.n_x], self.model.parameters, values)  # once: compiling it takes longer
+        work.interpreted.grid(t, z[: work.n_x], self.model.p, values)  # once: compiling it takes longer
         return values[0]
 
 
 def _power_of_forces(model):
     """The second of the signals "power" alone, without those that take most of its operations."""
     f = model.signals("power")[1].expression
-    t, z, p = f.sx_in()
-    return compiled(ca.Function("work", [t, z, p], [ca.densify(f(t, z, p)[1])]), "work")
+    return compiled(combined("work", lambda z, p, y: y[1], f), "work")
 
 
 @frozen

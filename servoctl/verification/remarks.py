@@ -5,12 +5,15 @@ from functools import partial
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import arguments
 from servoctl.control.lqr import COMPARED
 from servoctl.control.reference import of_plan
 from servoctl.markup import digits
 from servoctl.methods.transient import first_transient
 from servoctl.run import AGREES
 from servoctl.simulation import simulated
+from servoctl.spec.references import function_of
 
 TIMES, SAMPLES = 10, 3  # of the weights, of the samples; of a loop in a time constant, and of its error in its path
 
@@ -56,10 +59,11 @@ def _heavy(run, mechanism):
     """
     q, p = mechanism.q, mechanism.parameters
     scaled = [ca.densify(e / ca.sqrt(ca.diag(mechanism.mass))) for e in (mechanism.weight, *ca.horzsplit(mechanism.E))]
-    f = ca.Function("weights", [q.t, ca.vertcat(*map(q.jet, range(3))), ca.vertcat(*p.symbols)], scaled)
+    state, names = ca.vertcat(*map(q.jet, range(3))), run.model.reduction.references
+    f = function_of(q, names, "weights", state, ca.vertcat(*p.symbols), *scaled)
     shifts = np.hstack([part * np.pi * np.eye(q.nq) for part in (0.0, 0.5, 2.0)])
     states = np.vstack([run.jets[: q.nq, :1] + shifts, np.zeros((2 * q.n, shifts.shape[1]))])
-    values = f.call([run.t[0], states, run.model.parameters[: len(p.names)]])
+    values = f.call(arguments(f, run.t[0], states, run.model.p))
     still, turned, whole = np.hsplit(np.nan_to_num(np.abs(values[0]), posinf=0.0), 3)
     turned = np.hstack([still, turned]).max(axis=1)
     weight = turned[np.abs(whole - still).max(axis=1) <= AGREES * turned].max(initial=0.0)
@@ -86,9 +90,9 @@ def path(run, residual):
     k = max(q.order(residual), 0)
     jets = np.zeros((q.nq + k * q.n, len(run.t)))
     jets[: len(run.jets)] = run.jets[: len(jets), :1]
-    arguments = q.t, ca.vertcat(*map(q.jet, range(k + 1))), ca.vertcat(*p.symbols)
-    f = ca.Function("path", arguments, [ca.densify(residual)])
-    values = np.array(f(run.t[None], jets, run.model.parameters[: len(p.names)]))[0]
+    state, names = ca.vertcat(*map(q.jet, range(k + 1))), run.model.reduction.references
+    f = compiled(function_of(q, names, "path", state, ca.vertcat(*p.symbols), ca.densify(residual)), "path")
+    values = f.grid(run.t, jets, run.model.p[: f.n_p])[0]
     change, size = np.diff(values), float(np.ptp(values))
     moves = np.flatnonzero(np.abs(change) > AGREES * size)
     turns = run.t[moves[1:][np.diff(np.sign(change[moves])) != 0]]

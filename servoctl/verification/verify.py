@@ -159,7 +159,7 @@ class _Instants:
 
     def signals(self, kind):
         f = self.model.signals(kind)[1]
-        return f.grid(self.t, self.z[: f.n_x], self.model.parameters)
+        return f.grid(self.t, self.z[: f.n_x], self.model.p)
 
 
 class _Checks:
@@ -214,7 +214,7 @@ class _Checks:
     def _mass(self):
         """The largest inertia of each velocity along the run, (n,) array."""
         at, f = self.samples[0], self.samples[0].model.function("matrices")
-        return np.abs(f.grid(at.t[at.few], at.z[: f.n_x, at.few], at.model.parameters)[-self.model.n :]).max(axis=1)
+        return np.abs(f.grid(at.t[at.few], at.z[: f.n_x, at.few], at.model.p)[-self.model.n :]).max(axis=1)
 
     def _sizes(self, instants):
         """The size of each jet (n_z,): its largest value, at least FLOOR of what carries the same kinetic energy."""
@@ -349,9 +349,9 @@ class _Checks:
         n, n_z, rounding, parts = self.model.n, len(self.model.jet_names), ROUNDING / self.limit("balance"), []
         for at in self.instants:
             x = np.vstack([at.z[:n_z], at.inputs, at.signals("all_multipliers")])
-            y = at.model.function("balanced").grid(at.t, x, at.model.parameters)
+            y = at.model.function("balanced").grid(at.t, x, at.model.p)
             felt = self._response(
-                lambda t, x, at=at: at.model.function("balanced").grid(t, x, at.model.parameters)[:n],
+                lambda t, x, at=at: at.model.function("balanced").grid(t, x, at.model.p)[:n],
                 at.t[at.few],
                 x[:, at.few],
                 y[:n, at.few],
@@ -369,7 +369,7 @@ class _Checks:
             f = at.model.signals("residuals")[1]
             levels, few = at.signals("residuals"), at.few
             sizes = self._response(
-                lambda t, z, f=f, p=at.model.parameters: f.grid(t, z, p),
+                lambda t, z, f=f, p=at.model.p: f.grid(t, z, p),
                 at.t[few],
                 at.z[: f.n_x, few],
                 levels[:, few],
@@ -455,7 +455,7 @@ class _Checks:
 def _regular(model, t, z):
     """Whether the inputs are determined with the model's pivots at instants, (N,): B_D is as regular as B."""
     f, dependent, n = model.function("matrices"), list(model.reduction.realisation.dependent), model.n
-    values = f.grid(t, z[: f.n_x], model.parameters)
+    values = f.grid(t, z[: f.n_x], model.p)
     B = values[len(values) - n * (len(dependent) + 1) : -n].reshape(n, len(dependent), len(t)).T
     if not dependent or not np.all(np.isfinite(B)):
         return np.ones(len(t), dtype=bool)
