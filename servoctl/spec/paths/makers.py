@@ -1,0 +1,406 @@
+"""Paths from ends, points and limits."""
+
+import functools
+import math
+
+import numpy as np
+
+from servoctl.checks import array_of, as_numbers, finite, named, positive, whole_of
+from servoctl.errors import SpecificationError
+from servoctl.spec.paths import expressions
+from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
+from servoctl.spec.paths.transition import or_expression
+from servoctl.spec.paths.value import HALVINGS, Path, cut, require_ascending
+
+SHORTEST = 1e-12  # of a motion: phases that are shorter are left out, as they are rounding
+
+
+@or_expression(expressions.rest_to_rest)
+def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
+    """Move from rest to rest along the polynomial of degree 2k + 1 whose first k derivatives vanish at both ends.
+
+    Of class C^k, k = `smoothness`; it minimises the integral of the square of derivative k + 1. With sigma = (t -
+    t_start)/duration it is start + (end - start) I_sigma(k + 1, k + 1), the regularised incomplete beta function.
+    Held before and after.
+
+    Parameters
+    ----------
+    start, end : float or (dim,) array
+        The path before and after, SI.
+    duration : float
+        Time taken [s], positive.
+    smoothness : int, optional
+        Class k >= 0. A crane, or two cars and a spring, need 4.
+    t_start : float, optional
+        Time of departure [s].
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    SpecificationError
+        If start and end differ in size, the duration is not positive, the smoothness is no integer from 0 to 100,
+        or a number is not finite.
+    """
+    k = _class(smoothness)
+    start, end = _ends(start, end)
+    t_start = finite("t_start", t_start)
+    breaks, step = _stretched(_step(k), t_start, t_start + positive("duration", duration))
+    coefficients = step[:, None] * (end - start)[:, None]
+    coefficients[:, :, 0] += start
+    return _at_rest(breaks, coefficients, k)
+
+
+@or_expression(expressions.trapezoid)
+def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
+    """Cover a distance at a constant speed that is reached, and left, along smooth ramps.
+
+    Of class C^k, k = `smoothness`: during the first and last `ramp` seconds the speed rises and falls along the
+    polynomial of `rest_to_rest` of class k - 1. The cruising speed is distance/(duration - ramp). Starts at 0; held
+    before and after.
+
+    Parameters
+    ----------
+    distance : float or (dim,) array
+        Where the path ends, SI.
+    duration : float
+        Time taken [s], positive.
+    ramp : float
+        Length of each ramp [s], positive, at most half the duration.
+    smoothness : int, optional
+        Class k >= 1.
+    t_start : float, optional
+        Time of departure [s].
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    SpecificationError
+        If duration or ramp is not positive, the ramps do not fit in the duration, the smoothness is no integer from
+        1 to 100, or a number is not finite.
+    """
+    k, t_start = _class(smoothness, least=1), finite("t_start", t_start)
+    duration, ramp = positive("duration", duration), positive("ramp", ramp)
+    _, distance = _ends(0.0 * as_numbers(distance), distance)
+    if 2 * ramp > duration:
+        raise SpecificationError(
+            f"Two ramps of {ramp:g} s do not fit in a duration of {duration:g} s.",
+            "A trapezoid speeds up, cruises and slows down within its duration.",
+            f"A ramp of {duration / 2:g} s.",
+            "Shorten the ramp or lengthen the duration.",
+            ramp=ramp,
+            duration=duration,
+        )
+    corners = [t_start, t_start + ramp, t_start + duration - ramp, t_start + duration]
+    part = ramp / (duration - ramp)  # of the distance: what the cruise would cover twice during a ramp
+    begun, rise = _stretched(_rise(k), *corners[:2])
+    edges, mirrored = _rise(k)
+    fall = -mirrored[::-1] * (-1.0) ** np.arange(mirrored.shape[1])
+    ended, fall = _stretched((1.0 - edges[::-1], fall), *corners[2:])
+    fall = part * fall
+    fall[:, 0] += 1.0
+    cruises = int(corners[1] < corners[2])
+    cruise = np.zeros((cruises, rise.shape[1]))
+    cruise[:, :2] = 0.5, 0.5 - part / 2
+    table = np.concatenate([part * rise, cruise, fall])
+    breaks = np.concatenate([begun, ended[1 - cruises :]])
+    return _at_rest(breaks, table[:, None] * distance[:, None], k, np.isin(breaks, corners))
+
+
+def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
+    """Move from rest to rest along a line as quickly as limits of speed, acceleration and jerk allow.
+
+    The jerk is constant piece by piece, at its limit or zero, in at most seven phases: of class C^2. Held before and
+    after.
+
+    Parameters
+    ----------
+    start, end : float or (dim,) array
+        The path before and after, SI; they differ.
+    speed, acceleration, jerk : float
+        Limits along the line, SI, positive; what need not be reached is not reached.
+    t_start : float, optional
+        Time of departure [s].
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    SpecificationError
+        If start and end differ in size or are the same, a limit is not positive, or a number is not finite.
+    """
+    from scipy.interpolate import PPoly
+
+    start, end = _ends(start, end)
+    distance = float(np.linalg.norm(end - start))
+    if distance == 0.0:
+        rule, do = "They differ.", "Use rest_to_rest for a path that stands still."
+        raise SpecificationError(f"start and end are both {end.tolist()}.", rule, do=do, start=end.tolist())
+    limits = {"speed": speed, "acceleration": acceleration, "jerk": jerk}
+    v, a, j = (positive(name, value) for name, value in limits.items())
+    rise = min(a / j, math.sqrt(v / j), (distance / (2 * j)) ** (1 / 3))  # of the acceleration, to its largest value
+    a = j * rise
+    longest = math.sqrt(rise**2 / 4 + distance / a) - 1.5 * rise  # at this acceleration, if there is no cruise
+    constant = max(0.0, min(v / a - rise, longest))
+    cruise = max(0.0, distance / (a * (rise + constant)) - 2 * rise - constant)
+    phases = np.array([rise, constant, rise, cruise, rise, constant, rise])
+    lasting = phases > SHORTEST * phases.sum()
+    breaks = np.append(0.0, np.cumsum(phases[lasting]))
+    jerks = j * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])[lasting]
+    along = as_path(PPoly(jerks[None], breaks).antiderivative(3), smoothness=2)
+    direction = (end - start) / distance
+    coefficients = along.coefficients * direction[:, None]
+    coefficients[:, :, 0] += start
+    return _at_rest(finite("t_start", t_start) + along.breaks, coefficients, 2, np.isfinite(along.classes))
+
+
+@or_expression(expressions.spline)
+def spline(times, points, *, smoothness=2, ends="rest"):
+    """Pass through points at given times along SciPy's interpolating spline.
+
+    With `ends="rest"` the spline has degree 2k + 1, k = `smoothness`, and its first k derivatives vanish at both
+    ends, where it is held: of class C^k there, C^2k at the points between. It minimises the integral of the square
+    of derivative k + 1; two points give `rest_to_rest`. With `ends="natural"` it has the least odd degree 2m + 1 > k,
+    is of class C^2m, its derivatives m + 1 to 2m vanish at both ends, and its first and last polynomials go on.
+
+    Derivatives amplify noise: an error e of points at a distance h becomes one of about e (pi/h)^k in derivative k.
+    Use `fit` for measurements. A high smoothness over very uneven times overshoots between the points.
+
+    Parameters
+    ----------
+    times : (n,) array
+        Ascending [s], n >= 2.
+    points : (n,) or (n, dim) array
+        SI.
+    smoothness : int, optional
+        Class k >= 0.
+    ends : {"rest", "natural"}, optional
+        What happens at the ends.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    SpecificationError
+        If times do not ascend, shapes disagree, a number is not finite, the smoothness is no integer from 0 to 100, or
+        the points are too few or too unevenly timed for it.
+    NameUnknown
+        If `ends` is neither "rest" nor "natural".
+    """
+    rest, k = named(ends, ("rest", "natural"), "spline end") == "rest", _class(smoothness)
+    times, points = samples(times, points)
+    m = k if rest else (k + 1) // 2
+    if not rest and len(times) <= m:
+        raise SpecificationError(
+            f"A natural spline of smoothness {k} has {len(times)} points.",
+            f"Its degree is {2 * m + 1}, which needs at least {m + 1} points.",
+            f"smoothness={2 * (len(times) - 1)}.",
+            "Use more points, a lower smoothness, or ends='rest'.",
+            points=len(times),
+            smoothness=k,
+        )
+    unit = (times[-1] - times[0]) / (len(times) - 1)
+    vanishing = range(1, m + 1) if rest else range(m + 1, 2 * m + 1)
+    curve = _interpolating((times - times[0]) / unit, points, 2 * m + 1, vanishing)
+    breaks, coefficients, cuts = cut(times, by_derivatives(curve, 2 * m + 1, times[0], unit))
+    _require_passing(coefficients, np.flatnonzero(~cuts), times, points)
+    classes = np.where(cuts, np.inf, 2.0 * m)
+    classes[[0, -1]] = m if rest else np.inf
+    rule = "hold" if rest else "continue"
+    return Path(breaks, coefficients, classes, rule, rule)
+
+
+def _interpolating(x, points, degree, vanishing):
+    """SciPy's spline through points whose derivatives of some orders vanish at both ends; NaN where it finds none."""
+    from scipy.interpolate import BSpline, make_interp_spline
+
+    conditions = [(order, np.zeros(points.shape[1])) for order in vanishing]
+    try:
+        return make_interp_spline(x, points, k=degree, bc_type=(conditions, conditions) if conditions else None)
+    except (ValueError, np.linalg.LinAlgError):  # SciPy's equations are singular for very uneven intervals
+        return BSpline(np.repeat([x[0], x[-1]], degree + 1), np.full((degree + 1, points.shape[1]), np.nan), degree)
+
+
+def _require_passing(coefficients, places, times, points):
+    """Refuse pieces (n, dim, size) that miss points, which lie at these places among their ends."""
+    starts = (coefficients * (-1.0) ** np.arange(coefficients.shape[2])).sum(axis=2)[places[:-1]]
+    stops = coefficients.sum(axis=2)[places[1:] - 1]
+    miss = max(np.abs(starts - points[:-1]).max(), np.abs(stops - points[1:]).max())
+    if not miss <= expressions.MISSED * np.abs(points).max():
+        degree, ratio = coefficients.shape[2] - 1, np.diff(times).max() / np.diff(times).min()
+        raise SpecificationError(
+            f"The spline of degree {degree} misses its points by {miss:.1e}; its longest interval is {ratio:.3g} times "
+            "its shortest.",
+            f"A spline passes through its points to within {expressions.MISSED:g} of the largest.",
+            do="Choose intervals in proportion to the distances between the points, or a lower smoothness.",
+            degree=degree,
+            miss=miss,
+            ratio=ratio,
+        )
+
+
+def polynomials(breaks, coefficients, *, smoothness=None, before=None, after=None):
+    """Piecewise polynomials in the convention of SciPy's `PPoly`.
+
+    Parameters
+    ----------
+    breaks : (n + 1,) array
+        Ascending [s].
+    coefficients : (degree + 1, n) or (degree + 1, n, dim) array
+        Of powers of the time since the start of each piece, the highest power first, SI.
+    smoothness : int, optional
+        The class at the breaks; by default counted from the coefficients.
+    before, after : {"hold", "continue", "periodic"}, optional
+        What the path does outside, as the attributes of `Path` say.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    SpecificationError
+        If breaks do not ascend, the coefficients have another shape, a number is not finite, or there are too many
+        pieces for the class to be counted.
+    """
+    from scipy.interpolate import PPoly
+
+    breaks, table = array_of("breaks", breaks, None), as_numbers(coefficients)
+    require_ascending("breaks", breaks)
+    pieces, finite_numbers = len(breaks) - 1, int(np.isfinite(table).sum())
+    if table.ndim not in (2, 3) or 0 in table.shape or table.shape[1] != pieces or finite_numbers < table.size:
+        raise SpecificationError(
+            f"The coefficients of {pieces} pieces have the shape {table.shape}, {finite_numbers} of them finite.",
+            f"They are finite numbers of the shape (degree + 1, {pieces}) or (degree + 1, {pieces}, dim).",
+            do="Give the highest power first, a column for each piece.",
+            shape=table.shape,
+            pieces=pieces,
+        )
+    return as_path(PPoly(table, breaks), smoothness=smoothness, before=before, after=after)
+
+
+def samples(times, points):
+    """Ascending times (n,) and points (n, dim) of finite numbers, n >= 2."""
+    times, points = as_numbers(times), as_numbers(points)
+    right = times.ndim == 1 and points.ndim in (1, 2) and len(times) == len(points) > 1 and points.size
+    if not right or not np.isfinite(times).all() or not np.isfinite(points).all():
+        raise SpecificationError(
+            f"The times have the shape {times.shape}, the points {points.shape}.",
+            "There are at least two times, and one point for each: finite numbers.",
+            do="Put points in rows, and their entries in columns.",
+            times=times.shape,
+            points=points.shape,
+        )
+    require_ascending("times", times)
+    return times, points.reshape(len(times), -1)
+
+
+def _class(k, least=0):
+    return whole_of("smoothness", k, range(least, expressions.SMOOTHEST + 1))
+
+
+def _ends(start, end):
+    """Two points (dim,) of the same size, from numbers or vectors."""
+    points = [array_of(n, np.atleast_1d(as_numbers(v)), None) for n, v in (("start", start), ("end", end))]
+    if points[0].shape != points[1].shape or not points[0].size:
+        given = f"start has {points[0].size} entries, end has {points[1].size}."
+        sizes = {"start": points[0].size, "end": points[1].size}
+        raise SpecificationError(
+            given, "They are numbers or vectors of the same size, with at least one entry.", **sizes
+        )
+    return points
+
+
+def _at_rest(breaks, coefficients, k, corners=False):
+    """The path of class k at its ends, where it is held, and at corners (n + 1,); other breaks are cuts."""
+    classes = np.where(corners, float(k), np.full(len(breaks), np.inf))
+    classes[[0, -1]] = k
+    return Path(breaks, coefficients, classes, "hold", "hold")
+
+
+def _stretched(unit, first, last):
+    """A polynomial on (0, 1), by edges (n + 1,) and coefficients (n, size), between two instants: breaks, coefficients.
+
+    Where a cut is rounded in t, the parts beside it are expanded about their rounded ends, to first order.
+    """
+    edges, coefficients = unit
+    breaks = first + (last - first) * edges
+    breaks[-1] = last
+    require_ascending("breaks", breaks)
+    ends = [_halves(x) for x in (first, last)]
+    moved = [
+        math.fsum([t, *(-a * (1.0 - e) for a in ends[0]), *(-b * e for b in ends[1])])
+        for t, e in zip(breaks.tolist(), edges.tolist(), strict=True)
+    ]
+    low, high = (np.array(moved[side]) / np.diff(breaks) for side in (slice(-1), slice(1, None)))
+    powers = np.arange(coefficients.shape[1])
+    slopes = np.zeros_like(coefficients)
+    slopes[:, :-1] = coefficients[:, 1:] * powers[1:]
+    return breaks, coefficients + (low + high)[:, None] * slopes + (high - low)[:, None] * coefficients * powers
+
+
+def _halves(x):
+    """Two numbers with half the digits of x whose sum it is: their products with edges are exact."""
+    mantissa, exponent = math.frexp(x)
+    high = math.ldexp(round(math.ldexp(mantissa, 26)), exponent - 26)
+    return high, x - high
+
+
+@functools.lru_cache(maxsize=64)
+def _step(k):
+    """The step from 0 to 1 of class k over (0, 1), with its cuts: edges (n + 1,), coefficients (n, size)."""
+    return _cut_exactly(*_step_in_u(k))
+
+
+@functools.lru_cache(maxsize=64)
+def _rise(k):
+    """The integral from 0 of the step of class k - 1, as of `_step`."""
+    numerators, denominator = _step_in_u(k - 1)
+    multiple = math.lcm(*range(1, len(numerators) + 1))
+    powers = [0, *(c * multiple // (j + 1) for j, c in enumerate(numerators))]
+    powers[0] = -sum(c * (-1) ** j for j, c in enumerate(powers))
+    return _cut_exactly(powers, 2 * denominator * multiple)
+
+
+def _step_in_u(k):
+    """Whole numerators (size,) by powers of u, which goes from -1 to 1, and the denominator, of the step.
+
+    S = 1/2 + u/2 sum_(j=0..k) binomial(2j, j) ((1 - u^2)/4)^j.
+    """
+    powers = [0] * (2 * k + 2)
+    powers[0] = 4**k
+    for j in range(k + 1):
+        for i in range(j + 1):
+            powers[2 * i + 1] += math.comb(2 * j, j) * math.comb(j, i) * (-1) ** i * 4 ** (k - j)
+    return powers, 2 * 4**k
+
+
+def _cut_exactly(numerators, denominator):
+    """The polynomial in u with rational coefficients on (0, 1), expanded in parts: edges, coefficients (n, size).
+
+    Each coefficient is computed in whole numbers and rounded once.
+    """
+    n, unit = len(numerators) - 1, 2 ** (HALVINGS + 1)  # of u at middles of parts
+
+    def part(low, high):
+        middle, half = int((low + high - 1) * unit), int((high - low) * unit)
+        row = [c * unit ** (n - j) for j, c in enumerate(numerators)]
+        for i in range(n):
+            for j in reversed(range(i, n)):
+                row[j] += middle * row[j + 1]
+        return [c * half**k / (denominator * unit**n) for k, c in enumerate(row)]
+
+    def expand(low, high):
+        return np.array([part(*ends) for ends in zip(low.tolist(), high.tolist(), strict=True)])[:, None]
+
+    edges, coefficients, _ = cut(np.array([0.0, 1.0]), expand)
+    return edges, coefficients[:, 0]

@@ -1,0 +1,443 @@
+"""Paths as values: polynomials of time between breaks, with their derivatives and the class at each break."""
+
+import numpy as np
+
+from servoctl.checks import MOST_JETS, array_of, as_numbers, is_number, positive, whole, whole_of
+from servoctl.errors import SpecificationError
+from servoctl.values import Value, frozen, read_only
+
+RULES = ("hold", "continue", "periodic", None)
+SAME = 1e-12  # of the largest instant of a path: breaks that differ by less are one, but for rounding
+COUNTED = 1e-7  # of a derivative's largest value, up to which its jump is rounding: SciPy's monomials of C^9 have 1e-8
+CANCELLING = 16.0  # sum of the terms of a polynomial over its largest value, beyond which it is cut: 4 digits of 2
+SAMPLED = (-1.0, 0.0, 1.0, -0.75, 0.75, -0.5, 0.5, -0.25, 0.25)  # local times at which a derivative is large somewhere
+HALVINGS = 8  # of a piece: 256 parts, which a path of class 100 needs at its ends
+
+
+@frozen(eq=False)
+class Path(Value):
+    """A signal that is known with its derivatives: polynomials of time between breaks; made by `sv.paths`.
+
+    `path(t)` is its value, `path.jets(t, order)` has its derivatives, too. Paths are added, subtracted and multiplied
+    by numbers; `path[i]` is one component, and `x, y = path` takes it apart. A path of one component is a scalar: its
+    values have the shape of t. At a break the piece that begins there counts, at the last one the piece that ends.
+
+    Attributes
+    ----------
+    breaks : (n + 1,) array
+        Ends of the pieces [s], ascending.
+    coefficients : (n, dim, degree + 1) array
+        Of the powers 0, 1, ... of a time that goes from -1 to 1 on each piece, SI.
+    classes : (n + 1,) array
+        How many derivatives are continuous at each break: infinity where one polynomial is cut, -1 at jumps.
+        At an end that is held, how many derivatives vanish there.
+    before, after : {"hold", "continue", "periodic", None}
+        What the path does outside its breaks: it stands still, the polynomial goes on, or everything repeats. None: it
+        stands still as far as its derivatives vanish at this end, and is refused where others are asked for.
+    remark : str
+        What its maker says of it, such as the error of a fit; it does not take part in comparisons.
+    """
+
+    breaks: np.ndarray
+    coefficients: np.ndarray
+    classes: np.ndarray
+    before: str | None = None
+    after: str | None = None
+    remark: str = ""
+    __array_ufunc__ = None  # a number of NumPy times a path is a path
+
+    def __post_init__(self):
+        arrays = {"breaks": (None,), "coefficients": (None, None, None), "classes": (None,)}
+        for name, sizes in arrays.items():
+            array = as_numbers(getattr(self, name)) + 0.0
+            array_of(name, array[np.isfinite(array)] if name == "classes" else array, *sizes)
+            self.__dict__[name] = read_only(array)
+        pieces, shape = len(self.breaks) - 1, self.coefficients.shape
+        if shape[0] != pieces or 0 in shape or len(self.classes) != pieces + 1:
+            raise SpecificationError(
+                f"There are {pieces + 1} breaks, {len(self.classes)} classes, and coefficients of the shape {shape}.",
+                "Each break has a class, and each piece between two breaks the coefficients of each component.",
+                breaks=pieces + 1,
+                shape=shape,
+            )
+        require_ascending("breaks", self.breaks)
+        if not {self.before, self.after} <= set(RULES) or (self.before == "periodic") != (self.after == "periodic"):
+            raise SpecificationError(
+                f"The path has before={self.before!r}, after={self.after!r}.",
+                f"Each is one of {', '.join(map(repr, RULES))}, and a path that is periodic is so on both sides.",
+                before=self.before,
+                after=self.after,
+            )
+
+    @property
+    def dim(self):
+        """The number of components."""
+        return self.coefficients.shape[1]
+
+    def __call__(self, t):
+        """The values at instants.
+
+        Parameters
+        ----------
+        t : float or (N,) array
+            [s].
+
+        Returns
+        -------
+        float or (N,) array
+            Of one component; otherwise (dim,) or (dim, N).
+
+        Raises
+        ------
+        SpecificationError
+            As `jets` does.
+        """
+        values = self.jets(t, 0)[0]
+        values = values[0] if self.dim == 1 else values
+        return values if np.ndim(t) else values[..., 0]
+
+    def jets(self, t, order):
+        """The values and derivatives at instants.
+
+        Parameters
+        ----------
+        t : float or (N,) array
+            [s].
+        order : int
+            Of the highest derivative.
+
+        Returns
+        -------
+        (order + 1, dim, N) array
+            In powers of 1/s; N = 1 for a number.
+
+        Raises
+        ------
+        SpecificationError
+            If t is no finite number or array (N,) of them, the order is no whole number, or an instant lies outside
+            a path that neither holds, goes on nor repeats there.
+        """
+        t, order = array_of("t", np.atleast_1d(as_numbers(t)), None), whole("order", order, most=MOST_JETS)
+        first, last = self.breaks[0], self.breaks[-1]
+        held = self._held(t, max(order, 1))
+        t = (
+            first + np.mod(t - first, last - first)
+            if self.before == "periodic"
+            else np.where(held, t.clip(first, last), t)
+        )
+        pieces = self._pieces(t)
+        low, high = self.breaks[pieces], self.breaks[pieces + 1]
+        jets = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
+        jets[1:, held] = 0.0
+        for k in range(1, order + 1):
+            jets[k:] *= (k / ((high - low) / 2))[:, None]
+        return jets.transpose(0, 2, 1)
+
+    def _pieces(self, t):
+        """The piece (N,) that counts at each instant, the first and the last one outside."""
+        return (np.searchsorted(self.breaks, t, "right") - 1).clip(0, len(self.breaks) - 2)
+
+    def _held(self, t, order):
+        """Where (N,) the path stands still outside its breaks; refused if a derivative up to `order` would be lost."""
+        held = np.zeros(t.shape, dtype=bool)
+        for end, rule, outside in ((0, self.before, t < self.breaks[0]), (-1, self.after, t > self.breaks[-1])):
+            if rule is None and outside.any() and self.classes[end] < order:
+                instant, least = t[outside][0], min(order, self.classes[end] + 1)
+                raise SpecificationError(
+                    f"The path from t = {self.breaks[0]:g} to {self.breaks[-1]:g} s is asked for at t = {instant:g} s.",
+                    f"Nothing was said of it there, and its derivative {least:g} does not vanish at the end, so "
+                    "that it cannot be held.",
+                    f"t = {self.breaks[end]:g} s.",
+                    f"Stay inside, or make it with {'after' if end else 'before'}='hold' or 'continue'.",
+                    t=float(instant),
+                    end=float(self.breaks[end]),
+                )
+            held |= outside & (rule in ("hold", None))
+        return held
+
+    def __len__(self):
+        return self.dim
+
+    def __iter__(self):
+        return (self[i] for i in range(self.dim))
+
+    def __getitem__(self, i):
+        i = whole_of("component", i, range(-self.dim, self.dim))
+        return self._with(coefficients=self.coefficients[:, [i]])
+
+    def _with(self, **changed):
+        """The path with other fields, and without its maker's remark."""
+        fields = ("breaks", "coefficients", "classes", "before", "after")
+        return Path(**{name: getattr(self, name) for name in fields} | changed)
+
+    def __reduce__(self):
+        return Path, (self.breaks, self.coefficients, self.classes, self.before, self.after, self.remark)
+
+    def __mul__(self, factor):
+        return self._with(coefficients=self.coefficients * float(factor)) if is_number(factor) else NotImplemented
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, divisor):
+        return self * (1.0 / divisor) if is_number(divisor) else NotImplemented
+
+    def __neg__(self):
+        return self * -1.0
+
+    def __add__(self, other):
+        """The sum with a path, or with a constant: a number or a vector (dim,)."""
+        if not isinstance(other, Path):
+            constant = array_of("the constant added to a path", np.atleast_1d(as_numbers(other)), None)
+            _require_dim(self.dim, len(constant))
+            coefficients = self.coefficients.copy()
+            coefficients[:, :, 0] += constant
+            return self._with(coefficients=coefficients)
+        _require_dim(self.dim, other.dim)
+        (first, second), fields = together(self, other)
+        return Path(coefficients=first + second, **fields)
+
+    __radd__ = __add__
+
+    def __sub__(self, other):
+        return self + (-other if isinstance(other, Path) else -1.0 * as_numbers(other))
+
+    def __rsub__(self, other):
+        return -self + other
+
+    def then(self, other):
+        """The path, and then another one, moved in time to begin where it ends.
+
+        Parameters
+        ----------
+        other : Path
+            Of the same dimension; its values are not moved.
+
+        Returns
+        -------
+        Path
+            Of the class at the joint that both have together, -1 if the value jumps.
+
+        Raises
+        ------
+        SpecificationError
+            If the dimensions differ or one of the paths is periodic, and has no end.
+        """
+        _require_dim(self.dim, other.dim)
+        if "periodic" in (self.after, other.before):
+            rule, do = "A path follows the end of another one.", "Repeat neither of them."
+            raise SpecificationError("A periodic path was joined.", rule, do=do, after=self.after, before=other.before)
+        breaks = np.append(self.breaks, other.breaks[1:] + (self.breaks[-1] - other.breaks[0]))
+        coefficients = np.concatenate(of_one_degree(self.coefficients, other.coefficients))
+        joint = len(self.breaks) - 1
+        near = slice(joint - 1, joint + 1)
+        found = counted(breaks[joint - 1 : joint + 2], coefficients[near], sizes=largest_terms(breaks, coefficients))[1]
+        resting = min(self.classes[-1], other.classes[0]) if self.after != "continue" != other.before else -1
+        joined = max(found, resting) if found >= 0 else found
+        classes = np.concatenate([self.classes[:-1], [joined], other.classes[1:]])
+        return Path(breaks, coefficients, classes, self.before, other.after)
+
+    def at_rate(self, factor):
+        """The path along a clock that runs faster, from the same first instant on.
+
+        Parameters
+        ----------
+        factor : float
+            Positive; 2 halves the time that it takes.
+
+        Returns
+        -------
+        Path
+        """
+        first = self.breaks[0]
+        return self._with(breaks=first + (self.breaks - first) / positive("factor", factor))
+
+    def plot(self, order=2):
+        """Draw the path and its derivatives over its span.
+
+        Parameters
+        ----------
+        order : int, optional
+            Of the highest derivative.
+
+        Returns
+        -------
+        (order + 1,) array of Axes
+        """
+        from matplotlib.figure import Figure
+
+        t = np.linspace(self.breaks[0], self.breaks[-1], 1001)
+        jets = self.jets(t, order)
+        axes = Figure(figsize=(8.0, 2.0 * len(jets)), layout="constrained").subplots(len(jets), squeeze=False)[:, 0]
+        for k, (panel, values) in enumerate(zip(axes, jets, strict=True)):
+            panel.plot(t, values.T)
+            panel.set_ylabel(f"derivative {k}" if k else "path")
+        axes[-1].set_xlabel("t [s]")
+        return axes
+
+    def __repr__(self):
+        inner = self.classes[1:-1]
+        breaks, lowest = int(np.isfinite(inner).sum()), inner.min(initial=np.inf)
+        between = f", class {lowest:g} at {breaks} breaks" if breaks else ""
+        sides = ("before", self.before, 0), ("after", self.after, -1)
+        ends = ", ".join(f"{side} it: {_in_words(rule, self.classes[end])}" for side, rule, end in sides)
+        components = f"{self.dim} component{'s' * (self.dim > 1)}"
+        span = f"t = {self.breaks[0]:g} .. {self.breaks[-1]:g} s"
+        text = f"Path: {components}, {span}, degree {self.coefficients.shape[2] - 1}{between}\n  {ends}"
+        return text + f"\n  {self.remark}" * bool(self.remark)
+
+
+def _in_words(rule, class_):
+    """What a path does outside one of its ends, at which it has a class."""
+    meaning = {"continue": "goes on", "periodic": "repeats", "hold": "held", None: "held where it may be"}[rule]
+    return meaning + (f" (class {class_:g})" if class_ < np.inf else "")
+
+
+def _require_dim(dim, other):
+    if dim != other:
+        rule = "Paths are joined component by component."
+        raise SpecificationError(f"One has {dim} components, the other {other}.", rule, dimensions=(dim, other))
+
+
+def require_ascending(name, breaks):
+    """Refuse breaks (n + 1,) that do not ascend, or are fewer than two."""
+    falling = np.flatnonzero(~(np.diff(breaks) > 0))
+    if len(breaks) < 2 or len(falling):
+        i = int(falling[0]) if len(falling) else 0
+        given = ", ".join(f"{t:g}" for t in breaks[i : i + 2])
+        raise SpecificationError(
+            f"{name} {i} and {i + 1} are {given}." if len(falling) else f"There are {len(breaks)} {name}.",
+            "There are at least two, and they ascend.",
+            do="Sort them, and remove repeated ones.",
+            index=i + 1,
+        )
+
+
+def taylor(coefficients, pieces, tau, order):
+    """Taylor coefficients (order + 1, N, dim) of pieces (N,) of a table (n, dim, size), at local times (N,)."""
+    tau, result = tau[:, None], np.zeros((order + 1, len(tau), coefficients.shape[1]))
+    for j in reversed(range(coefficients.shape[2])):
+        result[1:] = result[1:] * tau + result[:-1]
+        result[0] = result[0] * tau + coefficients[pieces, :, j]
+    return result
+
+
+def taylor_at(breaks, coefficients, tau):
+    """Taylor coefficients (size, n, dim) of all pieces at one local time, in units of half their mean length."""
+    n, _, size = coefficients.shape
+    lengths = np.diff(breaks)
+    unit = (lengths.mean() / lengths) ** np.arange(size)[:, None]
+    return taylor(coefficients, np.arange(n), np.full(n, float(tau)), size - 1) * unit[:, :, None]
+
+
+def largest_terms(breaks, coefficients):
+    """The largest sum of absolute terms of each derivative, (size, dim), in the unit of `taylor_at`."""
+    return taylor_at(breaks, np.abs(coefficients), 1.0).max(axis=1)
+
+
+def counted(breaks, coefficients, before=None, after=None, sizes=None):
+    """The classes (n + 1,) at breaks, as far as derivatives agree up to `COUNTED` of their sizes."""
+    starts, stops = (taylor_at(breaks, coefficients, tau) for tau in (-1.0, 1.0))
+    jumps = np.concatenate([starts[:, :1], starts[:, 1:] - stops[:, :-1], stops[:, -1:]], axis=1)
+    jumps[0, [0, -1]] = 0.0  # at the ends: how many derivatives vanish
+    if before == "periodic":
+        jumps[:, [0, -1]] = starts[:, :1] - stops[:, -1:]
+    sizes = largest_terms(breaks, coefficients) if sizes is None else sizes
+    agree = (np.abs(jumps) <= COUNTED * sizes[:, None]).all(axis=2)
+    agree[:, [0, -1]] |= [before == "continue", after == "continue"]
+    return np.where(agree.all(axis=0), np.inf, agree.argmin(axis=0) - 1.0)
+
+
+def cut(breaks, expand):
+    """Breaks with cuts where large terms of opposite sign are left, coefficients, and which breaks (n + 1,) are cuts.
+
+    Parts whose terms exceed `CANCELLING` times the largest value of a derivative anywhere on the path are halved, as a
+    polynomial that is expanded in a shorter interval has smaller terms of higher powers. expand(low, high) returns
+    the coefficients (N, dim, size) between instants (N,).
+    """
+    coefficients, cuts = expand(breaks[:-1], breaks[1:]), np.zeros(len(breaks), dtype=bool)
+    for _ in range(HALVINGS):
+        terms = taylor_at(breaks, np.abs(coefficients), 1.0)
+        values = 0.0
+        for tau in SAMPLED:
+            values = np.maximum(values, np.abs(taylor_at(breaks, coefficients, tau)).max(axis=1))
+            large = (terms > CANCELLING * values[:, None]).any(axis=(0, 2))
+            if not large.any():
+                return breaks, coefficients, cuts
+        behind = np.flatnonzero(large) + 1
+        breaks = np.insert(breaks, behind, ((breaks[:-1] + breaks[1:]) / 2)[large])
+        cuts, count = np.insert(cuts, behind, True), 1 + large
+        halves, coefficients = np.repeat(large, count), np.repeat(coefficients, count, axis=0)
+        coefficients[halves] = expand(breaks[:-1][halves], breaks[1:][halves])
+    return breaks, coefficients, cuts
+
+
+def of_one_degree(*tables):
+    """Coefficients (n, dim, size) of several tables, filled up with zeros to one size."""
+    size = max(c.shape[2] for c in tables)
+    return [np.concatenate([c, np.zeros((*c.shape[:2], size - c.shape[2]))], axis=2) for c in tables]
+
+
+def together(*paths):
+    """Coefficients of several paths on common breaks, and what else their sum or stack has, by name of `Path`."""
+    rules = [_common_rule(paths, side) for side in ("before", "after")]
+    ends = [[p.breaks[end] for p in paths] for end in (0, -1)]
+    if "periodic" in rules and (np.ptp(ends, axis=1) > SAME * np.abs(ends).max()).any():
+        spans = ", ".join(f"{a:g} .. {b:g}" for a, b in zip(*ends, strict=True))
+        raise SpecificationError(f"Periodic paths have the spans {spans}.", "They have one period.", spans=spans)
+    breaks = np.concatenate([p.breaks for p in paths])
+    low, high = breaks.min(), breaks.max()
+    more = [low - (high - low)] * _differ(paths, "before") + [high + (high - low)] * _differ(paths, "after")
+    breaks = np.unique(np.append(breaks, more))
+    breaks = breaks[np.append(True, np.diff(breaks) > SAME * np.abs(breaks).max())]
+    classes = np.min([_classes_at(p, breaks) for p in paths], axis=0)
+    tables = of_one_degree(*(_between(p, breaks) for p in paths))
+    return tables, {"breaks": breaks, "classes": classes, "before": rules[0], "after": rules[1]}
+
+
+def stacked(*paths):
+    """One path with the components of several, on common breaks, each of the lowest of their classes."""
+    tables, fields = together(*paths)
+    return Path(coefficients=np.concatenate(tables, axis=1), **fields)
+
+
+def _differ(paths, side):
+    """Whether some of the paths go on and others stand still, before or after."""
+    rules = {getattr(p, side) for p in paths}
+    return "continue" in rules and len(rules) > 1
+
+
+def _common_rule(paths, side):
+    """What several paths do together before or after."""
+    rules = {getattr(p, side) for p in paths}
+    if "periodic" in rules and len(rules) > 1:
+        given = f"{side.capitalize()} their breaks one path repeats, another one does not."
+        rule, do = "Periodic paths are added to periodic ones.", "Make both with before='periodic', after='periodic'."
+        raise SpecificationError(given, rule, do=do, side=side)
+    return "continue" if "continue" in rules else None if None in rules else rules.pop()
+
+
+def _classes_at(path, breaks):
+    """The class of a path at breaks, among which its own are; infinity at the others."""
+    classes = np.full(len(breaks), np.inf)
+    nearest = np.abs(breaks - path.breaks[:, None]).argmin(axis=1)
+    np.minimum.at(classes, nearest, path.classes)
+    return classes
+
+
+def _between(path, breaks):
+    """Coefficients (n, dim, size) of a path between breaks, among which its own are."""
+    low, high = breaks[:-1], breaks[1:]
+    middle = (low + high) / 2
+    pieces, held = path._pieces(middle), path._held(middle, 1)
+    a, b = path.breaks[pieces], path.breaks[pieces + 1]
+    tau = ((middle - a) + (middle - b)) / (b - a)
+    powers = np.arange(path.coefficients.shape[2])[:, None]
+    parts = (
+        taylor(path.coefficients, pieces, tau, powers[-1, 0])
+        * ((high - low) / (b - a))[None, :, None] ** powers[:, :, None]
+    )
+    parts = parts.transpose(1, 2, 0)
+    parts[held] = 0.0
+    for end, outside in ((path.breaks[0], middle < path.breaks[0]), (path.breaks[-1], middle > path.breaks[-1])):
+        parts[held & outside, :, 0] = path.jets(end, 0)[0, :, 0]
+    return parts
