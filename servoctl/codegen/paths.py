@@ -13,7 +13,7 @@ import numpy as np
 from servoctl.errors import SpecificationError
 
 BY_INSTANT = "of_piece"  # name of the fourth input of a function whose last parameter selects the pieces of paths
-RULES = {None: 0, "hold": 0, "continue": 1, "periodic": 2}  # as in path.h
+RULES = {"hold": 0, "continue": 1, "periodic": 2}  # as in path.h
 
 _alive = weakref.WeakValueDictionary()  # by address
 
@@ -24,20 +24,19 @@ class Followed:
     `address` is a number of p for as long as this object lives; `jets` has the derivatives at some instants.
     """
 
-    def __init__(self, components):
-        self.components = tuple(components)  # (path, place of its component) of each reference
-        self._table = np.zeros((len(self.components), 7), dtype=np.int64)
-        for row, (path, i) in zip(self._table, self.components, strict=True):
-            pieces, dim, size = path.coefficients.shape
+    def __init__(self, paths):
+        self.paths = tuple(paths)  # of one component each
+        self._table = np.zeros((len(self.paths), 7), dtype=np.int64)
+        for row, path in zip(self._table, self.paths, strict=True):
+            pieces, _, size = path.coefficients.shape
             rules = RULES[path.before], RULES[path.after]
-            places = path.breaks.ctypes.data, path.coefficients.ctypes.data + 8 * i * size
-            row[:] = pieces, dim * size, size, *rules, *places
+            row[:] = pieces, size, size, *rules, path.breaks.ctypes.data, path.coefficients.ctypes.data
         self.address = float(self._table.ctypes.data)
         _alive[self.address] = self
 
     def jets(self, t, order, instant=None):
         """Derivatives 0 .. `order` at times (N,), of the pieces that instants (N,) select: ((order + 1) n, N)."""
-        rows = [path[i].jets(t, order, instant)[:, 0] for path, i in self.components]
+        rows = [path.jets(t, order, instant)[:, 0] for path in self.paths]
         return np.stack(rows, axis=1).reshape(-1, len(t))
 
 

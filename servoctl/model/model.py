@@ -123,7 +123,7 @@ def knots_within(model: "Model", span: tuple) -> tuple:
         # The entries of the store belong to the numbers of the specification.
         stored = np.array_equal(model.parameters, r.context.values)
         model._knots_within[span] = model._store.recall(f"knots {span}", build) if stored else build()
-    return model._knots_within.get(span, ())
+    return tuple(sorted({*model._knots_within.get(span, ()), *model.breaks(span).tolist()}))
 
 
 class Model(Detailed):
@@ -234,6 +234,11 @@ class Model(Detailed):
         paths = self.paths | {name: followed_path(name, path) for name, path in changes.items()}
         return Model(self.reduction, self._store, self.parameters, self._knots, self._functions, paths=paths)
 
+    def breaks(self, span, smooth=np.inf):
+        """Instants (N,) within a span at which a path has less than `smooth` continuous derivatives."""
+        paths = self._followed.paths if self.paths else ()
+        return np.unique(np.concatenate([np.zeros(0), *(path.breaks_below(smooth, *span) for path in paths)]))
+
     def _with(self, other, functions, variants=None):
         """The reduction of another model with the numbers and paths of this one."""
         return Model(other.reduction, other._store, self.parameters, self._knots, functions, variants, self.paths)
@@ -247,7 +252,7 @@ class Model(Detailed):
                 do=f"Write model.with_references({', '.join(f'{name}=...' for name in missing)}).",
                 missing=missing,
             )
-        return Followed([(path, 0) for path in self.paths.values()])
+        return Followed([path.held() for path in self.paths.values()])
 
     @cached_property
     def p(self):
@@ -258,7 +263,7 @@ class Model(Detailed):
         """Instants (N, 1 + R) of times (N,) [s]: with the jets of the paths that are followed there."""
         family = self.reduction.mechanism.q.family
         result = np.zeros((len(t), len(family), JETS + 1), dtype=REAL)
-        for name, path in self.paths.items() if len(t) else ():
+        for name, path in zip(self.paths, self._followed.paths, strict=True) if self.paths else ():
             order = min(JETS, path.coefficients.shape[2] - 1)
             sizes = np.array([[factorial(k)] for k in range(order + 1)], dtype=float)
             result[:, family.names.index(name), : order + 1] = (path.jets(t, order)[:, 0] / sizes).T
@@ -267,7 +272,7 @@ class Model(Detailed):
     def references_at(self, t):
         """Derivatives of the references at an instant, by names as points near a state have them."""
         found = {}
-        for name, path in self.paths.items():
+        for name, path in zip(self.paths, self._followed.paths, strict=True) if self.paths else ():
             jets = path.jets([t], path.coefficients.shape[2] - 1)[:, 0, 0]
             found |= {jet_of_reference(name, k): value for k, value in enumerate(jets.tolist()[: JETS + 1])}
         return found

@@ -7,6 +7,7 @@ import casadi as ca
 from servoctl.checks import named, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS
+from servoctl.spec.paths.scipy_paths import as_path
 
 _lock = threading.Lock()
 
@@ -83,7 +84,7 @@ class Family:
                     do="Give it another name, or its other path by model.with_references.",
                     name=name,
                 )
-        self.paths.update(paths)
+        self.paths.update({name: followed_path(name, path) for name, path in paths.items()})
         return References(self, paths)
 
     def jet(self, name, k):
@@ -123,5 +124,15 @@ def function_of(q, names, name, x, p, *outputs, jets="r"):
 
 
 def followed_path(name, path):
-    """The path of one component that a reference follows."""
+    """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
+    path = None if path is None else as_path(path)
+    if path is not None and path.dim != 1:
+        raise SpecificationError(
+            f"The path of the reference {name!r} has {path.dim} components.",
+            "A reference is one signal.",
+            f"{name}=path[0].",
+            "Name a reference for each component.",
+            name=name,
+            components=path.dim,
+        )
     return path

@@ -96,7 +96,7 @@ class Path(Value):
         values = values[0] if self.dim == 1 else values
         return values if np.ndim(t) else values[..., 0]
 
-    def jets(self, t, order):
+    def jets(self, t, order, instants=None):
         """The values and derivatives at instants.
 
         Parameters
@@ -105,6 +105,8 @@ class Path(Value):
             [s].
         order : int
             Of the highest derivative.
+        instants : (N,) array, optional
+            [s]; they select the pieces, on either side of a break. Default t.
 
         Returns
         -------
@@ -118,14 +120,12 @@ class Path(Value):
             a path that neither holds, goes on nor repeats there.
         """
         t, order = array_of("t", np.atleast_1d(as_numbers(t)), None), whole("order", order, most=MOST_JETS)
-        first, last = self.breaks[0], self.breaks[-1]
-        held = self._held(t, max(order, 1))
-        t = (
-            first + np.mod(t - first, last - first)
-            if self.before == "periodic"
-            else np.where(held, t.clip(first, last), t)
-        )
-        pieces = self._pieces(t)
+        first, last, at = self.breaks[0], self.breaks[-1], t if instants is None else np.asarray(instants)
+        held = self._held(at, max(order, 1))
+        if self.before == "periodic":
+            turns = np.floor((at - first) / (last - first)) * (last - first)
+            t, at = t - turns, at - turns
+        t, pieces = np.where(held, at.clip(first, last), t), self._pieces(at)
         low, high = self.breaks[pieces], self.breaks[pieces + 1]
         jets = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
         jets[1:, held] = 0.0
@@ -154,6 +154,19 @@ class Path(Value):
                 )
             held |= outside & (rule in ("hold", None))
         return held
+
+    def held(self):
+        """The path that is held outside where nothing was said of it."""
+        return self._with(before=self.before or "hold", after=self.after or "hold")
+
+    def breaks_below(self, smooth, low, high):
+        """Instants (N,) from `low` to `high` at which fewer than `smooth` derivatives are continuous."""
+        breaks = self.breaks[self.classes < smooth]
+        if self.before == "periodic":
+            first, period = self.breaks[0], self.breaks[-1] - self.breaks[0]
+            turns = np.arange(np.floor((low - first) / period), np.ceil((high - first) / period))
+            breaks = np.unique(breaks + period * turns[:, None]) if breaks.size else breaks
+        return breaks[(low <= breaks) & (breaks <= high)]
 
     def __len__(self):
         return self.dim
