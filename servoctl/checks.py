@@ -27,6 +27,7 @@ SUFFIXES = {
     "actuator or rate": "_input",
     "output": "_output",
     "parameter": "_parameter",
+    "reference": "_reference",
     "residual": "_residual",
     "row": "_residual",
 }

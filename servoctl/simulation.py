@@ -48,6 +48,7 @@ from servoctl.methods.stability import run_checked, warn_drifted, warn_many_step
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
 from servoctl.model.equations import invariant_names
+from servoctl.model.following import breaks_within
 from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.model.model import Model, including, knots_within
 from servoctl.model.start import State
@@ -224,7 +225,8 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     knots = knots_within(model, span)
     if not isinstance(method, Algebraic):
         ends = model.reduction.switches.ends_of_pieces(model.parameters, (min(span), max(span)))
-        knots = tuple(sorted({*knots, *ends.tolist()}))
+        order = method.order if isinstance(method, RungeKutta) else np.inf
+        knots = tuple(sorted({*knots, *ends.tolist(), *breaks_within(model, span, order).tolist()}))
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:

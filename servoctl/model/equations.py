@@ -5,6 +5,7 @@ from functools import cached_property, reduce
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import distinct
 from servoctl.codegen.paths import combined
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import cse, size_of_terms
@@ -346,6 +347,10 @@ class Equations(Invariants):
         mechanism = self.r.mechanism
         return list(mechanism.inputs), [mechanism.outputs[name] for name in mechanism.inputs]
 
+    def _references(self):
+        q, read = self.q, reference_names(self.r)
+        return list(read.values()), [q.family.jet(name, 0) for name in read]
+
     def _energy(self):
         return ["energy"], [self.r.mechanism.energy]
 
@@ -440,6 +445,7 @@ SIGNALS = {  # names and expressions of each group
     "multipliers": Equations._multipliers,
     "outputs": Equations._outputs,
     "given_inputs": Equations._given_inputs,
+    "references": Equations._references,
     "energy": Equations._energy,
     "balance": Equations._balance,
     "coordinate_rates": Equations._coordinate_rates,
@@ -466,12 +472,17 @@ def residual_names(reduction):
     return (*residual_rows(reduction), *reduction.mechanism.reported, *reduction.mechanism.q.invariants)
 
 
+def reference_names(reduction):
+    """The names by which references are read, by their own: x_reference beside a coordinate x."""
+    return distinct("reference", reduction.references, reduction.mechanism.signals)
+
+
 def signal_groups(reduction):
     """The group of each signal that is no jet, {signal name: key of `SIGNALS`}."""
     mechanism, program = reduction.mechanism, reduction.program
     names = mechanism.q.force_names
     groups = dict.fromkeys(mechanism.outputs, "outputs") | dict.fromkeys(mechanism.inputs, "given_inputs")
-    groups |= {"energy": "energy"}
+    groups |= dict.fromkeys(reference_names(reduction).values(), "references") | {"energy": "energy"}
     if program.by == "actuators":
         groups = dict.fromkeys(mechanism.actuators, "actuation") | groups
     else:

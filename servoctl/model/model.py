@@ -16,6 +16,7 @@ from servoctl.errors import ServoError, SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
+from servoctl.model.following import SMOOTHER, breaks_within
 from servoctl.model.jets import jet_names_to
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
@@ -108,9 +109,10 @@ def default_start(model: "Model", t: float = 0.0) -> State:
     return model.start(t, {name: value for name, value in guess.items() if name in model.state_names})
 
 
-def knots_within(model: "Model", span: tuple) -> tuple:
+def knots_within(model: "Model", span: tuple, smoother=SMOOTHER) -> tuple:
     """Knots of the paths within a span, in either direction; SpecificationError if a path is not smooth enough there.
 
+    Of paths of references those with fewer than `smoother` continuous derivatives beyond those in the actuation.
     Of a spline of many pieces they are those between the first and the last that are inspected; the others, at which
     series end, are `Switches.ends_of_pieces`.
     """
@@ -123,7 +125,7 @@ def knots_within(model: "Model", span: tuple) -> tuple:
         # The entries of the store belong to the numbers of the specification.
         stored = np.array_equal(model.parameters, r.context.values)
         model._knots_within[span] = model._store.recall(f"knots {span}", build) if stored else build()
-    return tuple(sorted({*model._knots_within.get(span, ()), *model.breaks(span).tolist()}))
+    return tuple(sorted({*model._knots_within.get(span, ()), *breaks_within(model, span, smoother).tolist()}))
 
 
 class Model(Detailed):
@@ -233,11 +235,6 @@ class Model(Detailed):
         changes = by_name(paths, self.paths, "reference", "The references")
         paths = self.paths | {name: followed_path(name, path) for name, path in changes.items()}
         return Model(self.reduction, self._store, self.parameters, self._knots, self._functions, paths=paths)
-
-    def breaks(self, span, smooth=np.inf):
-        """Instants (N,) within a span at which a path has less than `smooth` continuous derivatives."""
-        paths = self._followed.paths if self.paths else ()
-        return np.unique(np.concatenate([np.zeros(0), *(path.breaks_below(smooth, *span) for path in paths)]))
 
     def _with(self, other, functions, variants=None):
         """The reduction of another model with the numbers and paths of this one."""

@@ -18,7 +18,7 @@ LARGEST_EXPLAINED = 20_000  # operations of the accelerations, beyond which rela
 
 def describe(model, full):
     """The lines of a printed model: what was done to the specification; if full, with what the derivation rests on."""
-    r, rows = model.reduction, (_title, _longer, _left_out, _raised, _hidden, _free, _chosen, _switches)
+    r, rows = model.reduction, (_title, _longer, _left_out, _raised, _hidden, _free, _chosen, _follows, _switches)
     texts = [fitted(lambda room, row=row: row(model, r, room), full) for row in rows]
     return "\n  ".join(filter(None, [*texts, *(_derivation(r) if full else ())])).splitlines()
 
@@ -93,6 +93,21 @@ def _chosen(model, r, room):
     chosen = "nearest to the wishes" if program.toward else norm
     own = self_motion(r) or "no self-motion"
     return f"{m} actuators for {k} residual{'s' * (k > 1)}: {chosen}; {own}"
+
+
+def _follows(model, r, room):
+    """The references, with the derivatives that the actuation contains."""
+    groups = {}
+    for name, order in r.follows.items():
+        groups.setdefault(max(order, 0), []).append(name)
+    several = {0: "", 1: " with its first derivative"}
+
+    def told(order, names):
+        each = ", each" * (len(names) > 1) * (order > 0)
+        most = several.get(order, f" with its derivatives up to order {order}")
+        return f"{listed(names, room)}{each}{most}"
+
+    return f"follows {'; '.join(told(order, names) for order, names in sorted(groups.items()))}" * bool(groups)
 
 
 def _switches(model, r, room):

@@ -25,7 +25,7 @@ from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
-from servoctl.spec.references import names_in
+from servoctl.spec.references import orders_in
 from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
@@ -90,6 +90,25 @@ class Reduction(Packed):
     def references(self):
         """Names of the references in the program and the mechanism."""
         return references(self.mechanism, self.program)
+
+    @cached_property
+    def follows(self):
+        """The highest derivative of each reference in the actuation, by name: below zero for one that may jump itself.
+
+        That of a force which is not differentiated may jump.
+        """
+        times = {}
+        for row in self.rows:
+            for source, count in row.uses.items():
+                times[source] = max(times.get(source, -row.order), count + 2 - row.order)
+        forces = times.pop(Balance(), 0)
+        sources = {**self.program.residuals, **self.mechanism.constraints, Balance(): self.balance}
+        times[Balance()] = forces if forces > 0 else -1
+        highest = dict.fromkeys(self.references, -1)
+        for source, expression in sources.items():
+            for name, order in orders_in(self.mechanism.q, [expression]).items():
+                highest[name] = max(highest[name], order + times.get(source, 0))
+        return highest
 
     @property
     def hidden(self):
@@ -245,7 +264,7 @@ def references(mechanism, program):
     m, chosen = mechanism, (*program.weights.values(), *program.toward.values())
     of_program = (*program.with_turns.values(), *(e for e in chosen if isinstance(e, ca.SX)))
     named_rows = (*m.constraints.values(), *m.followers.values(), *m.outputs.values(), *m.reported.values())
-    return names_in(m.q, [*of_program, *named_rows, m.balance, m.energy, m.E, m.q.V, m.q.h])
+    return tuple(orders_in(m.q, [*of_program, *named_rows, m.balance, m.energy, m.E, m.q.V, m.q.h]))
 
 
 def holds(reduction, values):
@@ -298,6 +317,13 @@ def require_parts(mechanism, program, guess):
             "Names of rows differ.",
             do="Rename one of them.",
             name=twice[0],
+        )
+    for name in set(references(mechanism, program)) & {*mechanism.parameters.names}:
+        raise SpecificationError(
+            f"A reference and a parameter are both named {name!r}.",
+            "A reference has a path, a parameter a number.",
+            do="Rename one of them.",
+            name=name,
         )
     known = [*q.names, *(name for k in range(1, 8) for name in q.jet_names(k))]
     for name, value in guess.items():

@@ -33,6 +33,9 @@ class Program(Packed):
         The wish u_wish by actuator: expressions of t, q and γ', such as a spring that draws a redundant arm towards a
         posture, or a brake that damps its self-motion. Default 0 each.
 
+    jumps : bool, optional
+        Whether forces may jump at breaks of the paths of references. By default a path of too low a class is refused.
+
     Attributes
     ----------
     with_turns : dict of str to SX scalar
@@ -48,7 +51,7 @@ class Program(Packed):
         If `by` is another word.
     """
 
-    def __init__(self, residuals, by="actuators", weights=None, toward=None):
+    def __init__(self, residuals, by="actuators", weights=None, toward=None, jumps=False):
         if not isinstance(residuals, dict) or not residuals:
             raise SpecificationError(
                 f"The program's residuals are {residuals!r}.",
@@ -62,7 +65,7 @@ class Program(Packed):
         without_effect(chosen if by != "actuators" else [], f"with by={by!r}: they choose among actuators")
         self.with_turns = {name: _residual(name, value) for name, value in residuals.items()}
         self.residuals = {name: without_turns(value) for name, value in self.with_turns.items()}
-        self.by = by
+        self.by, self.jumps = by, require_kind(bool, "jumps", jumps, "jumps=True")
         self.metric = "inertia" if isinstance(weights, str) and weights == "inertia" else "actuators"
         weights = None if self.metric == "inertia" else weights
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
@@ -83,7 +86,7 @@ class Program(Packed):
         expressions = [ca.SX(value) for part in parts for value in part.values()]
         symbols = ca.symvar(ca.vertcat(*expressions))
         text = as_text(ca.Function("program", symbols, expressions))
-        return [[*part] for part in parts], self.by, self.metric, [s.name() for s in symbols], text
+        return [[*part] for part in parts], self.by, self.metric, self.jumps, [s.name() for s in symbols], text
 
     @property
     def names(self):
@@ -142,7 +145,8 @@ class Program(Packed):
         residuals : dict of str to SX scalar
         weights, toward : dict of str to float or SX
         """
-        return Program(residuals, self.by, "inertia" if self.metric == "inertia" else weights or None, toward or None)
+        weights = "inertia" if self.metric == "inertia" else weights or None
+        return Program(residuals, self.by, weights, toward or None, self.jumps)
 
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"
@@ -152,7 +156,7 @@ def no_program():
     """The program without residuals: forces alone determine the motion."""
     program = object.__new__(Program)
     program.by, program.residuals, program.with_turns, program.weights, program.toward = "actuators", {}, {}, {}, {}
-    program.metric = "actuators"
+    program.metric, program.jumps = "actuators", False
     return program
 
 

@@ -102,11 +102,12 @@ class Family:
         return self._places.get(key)
 
 
-def names_in(q, expressions):
-    """Names of the references in SX expressions, in the order in which they were made, a tuple of str."""
+def orders_in(q, expressions):
+    """The highest derivative of each reference in SX expressions, by name in the order in which they were made."""
     symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *map(ca.vec, expressions))) if len(q.family) else []
-    places = {place[2] for place in map(q.where, symbols) if place and place[0] == "r"}
-    return tuple(name for i, name in enumerate(q.family.names) if i in places)
+    places = sorted(place for place in map(q.where, symbols) if place and place[0] == "r")
+    highest = {i: k for _, k, i in places}  # the last one counts
+    return {name: highest[i] for i, name in enumerate(q.family.names) if i in highest}
 
 
 def function_of(q, names, name, x, p, *outputs, jets="r"):

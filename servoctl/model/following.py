@@ -1,0 +1,53 @@
+"""The paths that a model follows: what its motion needs of them, and the instants at which its steps end."""
+
+import numpy as np
+
+from servoctl.errors import SpecificationError
+
+SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
+
+
+def breaks_within(model, span, smoother=np.inf):
+    """Instants (N,) within a span at which a path has fewer continuous derivatives than a motion by some method needs.
+
+    That are `smoother` more than the actuation contains. SpecificationError where it has fewer than these.
+    """
+    low, high = min(span), max(span)
+    found = [np.zeros(0)]
+    for name, path in model.paths.items():
+        needs = model.reduction.follows[name]
+        require_class(name, path, needs, (low, high), model.reduction.program.jumps)
+        found.append(path.held().breaks_below(needs + smoother, low, high))
+    return np.unique(np.concatenate(found))
+
+
+def require_class(name, path, needs, span, jumps):
+    """Refuse a path that has too few continuous derivatives inside a span, or is not known there."""
+    low, high = span
+    for end, rule, outside in ((0, path.before, low < path.breaks[0]), (-1, path.after, high > path.breaks[-1])):
+        if outside and rule is None and path.classes[end] < needs:
+            at, side = float(path.breaks[end]), "after" if end else "before"
+            raise SpecificationError(
+                f"The path of {name} is asked for from t = {low:g} to {high:g} s, and nothing was said of it {side} "
+                f"t = {at:g} s.",
+                f"It is held there if {needs} derivatives, which the actuation contains, vanish; "
+                f"{path.classes[end]:g} do.",
+                f"t_span within {path.breaks[0]:g} .. {path.breaks[-1]:g} s.",
+                f"Stay inside, or make the path with {side}='hold', 'continue' or 'periodic'.",
+                name=name,
+                t=at,
+            )
+    held = path.held()
+    inside = [t for t in held.breaks_below(needs - (1 if jumps else 0), low, high) if low < t < high]
+    if inside:
+        class_ = int(held.classes[np.argmin(np.abs(held.breaks - inside[0]))]) if held.before != "periodic" else None
+        has = "" if class_ is None else f", has {f'C^{class_}' if class_ >= 0 else 'a jump'}"
+        raise SpecificationError(
+            f"The path of {name} needs C^{needs}{has} at t = {inside[0]:.6g} s.",
+            f"The actuation contains its derivative {needs}, which must be continuous.",
+            do=f"Make it with smoothness={needs}"
+            + ("." if jumps else ", or write Program(..., jumps=True) where forces may jump."),
+            name=name,
+            needs=needs,
+            t=float(inside[0]),
+        )

@@ -1,0 +1,240 @@
+"""References: symbols whose values are paths; one model for every path."""
+
+import pickle
+import subprocess
+import sys
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.interpolate import PPoly, make_interp_spline
+
+import servoctl as sv
+from servoctl.codegen import compiler, interpreted
+from servoctl.errors import NameUnknown, SpecificationError
+from servoctl.model import store
+
+PATH = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(5.0, 2.0), duration=6.0, smoothness=4)
+HANGING = {"l": 4.0}
+
+
+def crane():
+    q = sv.coordinates("x l theta")
+    x, length, theta = q
+    p = sv.parameters(m_trolley=10.0, m_load=100.0, g=9.81)
+    load = ca.vertcat(x + length * ca.sin(theta), -length * ca.cos(theta))
+    gibbs = sv.particle(q, p.m_trolley, [x, 0]) + sv.particle(q, p.m_load, load)
+    return sv.Mechanism(q, gibbs, p.m_load * p.g * load[1], {"trolley": x, "hoist": length}, p), load
+
+
+def followed(path=PATH, **options):
+    mechanism, load = crane()
+    r = mechanism.q.references(X=path[0], Z=path[1])
+    program = sv.Program({"X": load[0] - r.X, "Z": load[1] + r.Z}, by="actuators", **options)
+    return sv.derive(mechanism, program)
+
+
+def spelled(start=(0.0, 4.0), end=(5.0, 2.0), duration=6.0, smoothness=4):
+    """The crane with its path as an expression of time."""
+    mechanism, load = crane()
+    path = sv.paths.rest_to_rest(mechanism.q.t, start, end, duration, smoothness)
+    return sv.derive(mechanism, sv.Program({"X": load[0] - path[0], "Z": load[1] + path[1]}, by="actuators"))
+
+
+def cart_pole(reference):
+    """A cart-pole; `reference(q)` is what the cart follows."""
+    q = sv.coordinates("x theta")
+    x, theta = q
+    p = sv.parameters(M=1.0, m=0.1, L=0.5, g=9.81)
+    tip = ca.vertcat(x + p.L * ca.sin(theta), p.L * ca.cos(theta))
+    gibbs = sv.particle(q, p.M, [x, 0]) + sv.particle(q, p.m, tip)
+    mechanism = sv.Mechanism(q, gibbs, p.m * p.g * tip[1], {"force": x}, p)
+    return sv.derive(mechanism, sv.Program({"cart": x - reference(q)}, by="actuators"))
+
+
+def same(run, other, within):
+    for name in other.names:
+        assert np.abs(run[name] - other[name]).max() <= within * max(1.0, np.abs(other[name]).max()), name
+
+
+def test_derivatives_of_expressions_are_those_along_the_path():
+    q = sv.coordinates("x")
+    r = q.references(X=None, x=None)
+    expression = ca.sin(r.X * r["x"]) + r.d(1)[0] * q.t + r.X**3
+    rates = q.derivatives([expression], 4)
+    a, b = np.polynomial.Polynomial([0.3, 1.0, -0.5, 0.2]), np.polynomial.Polynomial([1.0, -0.4, 0.1, 0.05])
+    symbols = [q.t, *(s for k in range(6) for s in r.d(k))]
+    f = ca.Function("f", symbols, [ca.vertcat(*(level[0] for level in rates))])
+    t = ca.SX.sym("t")
+    along = ca.sin(ca.polyval(a.coef[::-1], t) * ca.polyval(b.coef[::-1], t)) + ca.polyval(a.coef[::-1], t) ** 3
+    along += ca.polyval(a.deriv().coef[::-1], t) * t
+    exact = [along]
+    for _ in range(4):
+        exact.append(ca.jacobian(exact[-1], t))
+    numbers = ca.Function("exact", [t], [ca.vertcat(*exact)])(0.7).full().ravel()
+    jets = [float(poly.deriv(k)(0.7)) if k else float(poly(0.7)) for k in range(6) for poly in (a, b)]
+    assert np.allclose(f(0.7, *jets).full().ravel(), numbers, rtol=1e-13)
+
+
+def test_symbols_are_named_once_and_read_by_their_names():
+    q = sv.coordinates("x y")
+    r = q.references(X=PATH[0], Y=None)
+    assert (r.names, len(r), repr(r)) == (("X", "Y"), 2, "References(X Y)")
+    X, Y = r
+    assert q.where(X) == ("r", 0, 0) and q.where(r.d(2)[1]) == ("r", 2, 1) and Y.is_symbolic() and not q.is_jet(X)
+    assert q.order(r.d(3)[0]) == -1
+    with pytest.raises(SpecificationError, match="The reference 'X' is a reference already"):
+        q.references(X=PATH[0])
+    with pytest.raises(AttributeError, match="No reference is named 'Z'; there are X, Y"):
+        _ = r.Z
+    with pytest.raises(SpecificationError, match="has 2 components"):
+        q.references(P=PATH)
+    with pytest.raises(SpecificationError, match="order=41"):
+        r.d(41)
+
+
+def test_a_flat_plan_is_that_of_the_expression():
+    new, old = followed(), spelled()
+    assert new.reduction.needs == old.reduction.needs and new.reduction.follows == {"X": 4, "Z": 4}
+    assert "follows X, Z, each with its derivatives up to order 4" in str(new)
+    run, other = (sv.simulate(m, m.start(guess=HANGING), (0.0, 6.0)) for m in (new, old))
+    same(run, other, 1e-13)
+    assert sv.verify(run).passed and run.counters["steps"] == other.counters["steps"]
+    assert np.array_equal(run["X"], PATH[0](run.t)) and np.abs(run["X_residual"]).max() < 1e-14
+    assert new.function("path").operations < 0.5 * old.function("path").operations
+
+
+@pytest.mark.parametrize("method", ["Taylor", "RadauIIA", "RK8", "DOP853"])
+def test_integrated_motions_are_those_of_the_expression(method):
+    path = sv.paths.rest_to_rest(start=0.0, end=1.0, duration=1.0)
+    new = cart_pole(lambda q: q.references(x=path).x)
+    old = cart_pole(lambda q: sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0))
+    run, other = (sv.simulate(m, m.start(-0.2, theta=0.0, dtheta=0.0), (-0.2, 1.2), method) for m in (new, old))
+    same(run, other, 1e-10)
+    assert np.array_equal(run["x_reference"], path(run.t)) and run["x"] is not run["x_reference"]
+
+
+def test_another_path_derives_compiles_and_writes_nothing(monkeypatch, tmp_path):
+    model = followed()
+    first = sv.simulate(model, model.start(guess=HANGING), (0.0, 6.0))
+    first["trolley"]
+    interpreted.machine(model.signals("actuation")[1].expression, 100)  # of many points, one unit for all functions
+    monkeypatch.setattr(store, "_write", None)
+    monkeypatch.setattr(compiler, "library", lambda *_, **__: pytest.fail("compiled"))
+    monkeypatch.setattr(interpreted, "MANY_POINTS", np.inf)
+    monkeypatch.setattr(type(model), "_of", None)
+    other = model.with_references(X=0.5 * PATH[0], Z=sv.paths.rest_to_rest(4.0, 3.0, 2.0, smoothness=6))
+    run = sv.simulate(other, other.start(guess=HANGING), (0.0, 6.0))
+    assert run["trolley"].max() < 0.6 * first["trolley"].max()
+    assert 2.0 in run.knots or 2.0 not in run.t  # C^6 is more than the plan needs: no step ends there
+    same(sv.simulate(model, model.start(guess=HANGING), (0.0, 6.0)), first, 0.0)
+
+
+def test_a_model_follows_what_scipy_makes():
+    t = np.linspace(0.0, 6.0, 61)
+    points = np.column_stack([2.5 * (1 - np.cos(np.pi * t / 6)), 3 + np.cos(np.pi * t / 6)])
+    spline = sv.paths.as_path(make_interp_spline(t, points, k=9))
+    model = followed().with_references(X=spline[0], Z=spline[1])
+    run = sv.simulate(model, model.start(guess=HANGING), (0.0, 6.0))
+    assert sv.verify(run).passed and np.abs(run["x"] + run["l"] * np.sin(run["theta"]) - spline[0](run.t)).max() < 1e-12
+    quadratic = PPoly(np.array([[0.05], [0.0], [4.0]]), [0.0, 6.0])  # of another degree, continued on both sides
+    falling = sv.paths.as_path(quadratic, before="continue", after="continue")
+    model = model.with_references(X=0.0 * falling, Z=falling)
+    run = sv.simulate(model, model.start(guess=HANGING), (0.0, 2.0))
+    assert np.abs(run["hoist"] + 100.0 * (9.81 - 0.1)).max() < 1e-9  # free of swing: m (g - Z'')
+
+
+@pytest.mark.parametrize("smoothness", [2, 3, 4])
+@pytest.mark.parametrize("jumps", [False, True])
+def test_paths_have_as_many_derivatives_as_the_actuation(smoothness, jumps):
+    path = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(1.0, 3.0), duration=3.0, smoothness=smoothness)
+    model = followed(path, jumps=jumps)
+    assert sv.verify(sv.simulate(model, model.start(guess=HANGING), (0.0, 3.0))).passed  # its end is not passed
+    if smoothness + jumps < 4:
+        with pytest.raises(SpecificationError, match=rf"needs C\^4, has C\^{smoothness} at t = 3 s"):
+            sv.simulate(model, model.start(guess=HANGING), (0.0, 4.0))
+    else:
+        assert sv.verify(sv.simulate(model, model.start(guess=HANGING), (0.0, 4.0))).passed
+
+
+@pytest.mark.parametrize("method", ["Taylor", "RadauIIA", "RK4", "DOP853"])
+def test_a_jerk_may_jump(method):
+    q, p = sv.coordinates("x"), sv.parameters(m=2.0)
+    mechanism = sv.Mechanism(q, sv.particle(q, p.m, [q[0]]), None, {"F": q[0]}, p)
+    r = q.references(J=sv.paths.polynomials([0.0, 1.0, 2.5, 4.0], np.array([[1.0, -2.0, 0.5]])))
+    model = sv.derive(mechanism, sv.Program({"jerk": q.d(3)[0] - r.J}, by="actuators"))
+    assert model.reduction.follows == {"J": -1}
+    run = sv.simulate(model, model.start(x=0.0, dx=0.0, d2x=0.0), (0.0, 4.0), method)
+    exact = np.interp(run.t, [0.0, 1.0, 2.5, 4.0], np.cumsum([0.0, 1.0, -3.0, 0.75]))
+    assert np.abs(run["F"] - 2.0 * exact).max() < 3e-12
+
+
+def test_a_support_and_a_wind_are_followed():
+    def pendulum(base, wind):
+        q, p = sv.coordinates("b theta"), sv.parameters(m=1.0, L=1.0, g=9.81)
+        b, theta = q
+        tip = ca.vertcat(b + p.L * ca.sin(theta), -p.L * ca.cos(theta))
+        gibbs = sv.particle(q, p.m, tip) + sv.particle(q, p.m, [b, 0])
+        constraints, forces = {"support": b - base(q)}, {"theta": wind(q)}
+        actuators = {"torque": theta}
+        mechanism = sv.Mechanism(q, gibbs, p.m * p.g * tip[1], actuators, p, constraints=constraints, forces=forces)
+        program = sv.Program({"level": theta - 0.3}, by="actuators")
+        model = sv.derive(mechanism, program)
+        return sv.simulate(model, model.start(), (0.0, 1.0))
+
+    move = dict(start=0.0, end=0.5, duration=1.0)
+    new = pendulum(
+        lambda q: q.references(B=sv.paths.rest_to_rest(**move)).B,
+        lambda q: q.references(W=sv.paths.rest_to_rest(**move)).W,
+    )
+    old = pendulum(*2 * [lambda q: sv.paths.rest_to_rest(q.t, **move)])
+    same(new, old, 1e-13)
+
+
+def test_programs_of_place_speed_and_acceleration_follow_one_path():
+    path = sv.paths.rest_to_rest(start=0.0, end=1.0, duration=1.0, smoothness=4)
+    q, p = sv.coordinates("x y z"), sv.parameters(m=2.0)
+    mechanism = sv.Mechanism(
+        q, sv.particle(q, p.m, list(q)), None, {f"F{s}": s for s in q.names for s in ()} or None, p
+    )
+    r = q.references(r=path)
+    residuals = {"place": q[0] - r.r, "speed": q.d(1)[1] - r.d(1)[0], "acceleration": q.d(2)[2] - r.d(2)[0]}
+    model = sv.derive(mechanism, sv.Program(residuals, by="ideal"))
+    run = sv.simulate(model, model.start(y=0.0, z=0.0, dz=0.0), (0.0, 1.0))
+    assert max(np.abs(run[name] - path(run.t)).max() for name in "xyz") < 1e-11
+    back = sv.simulate(model, model.start(1.0, y=1.0, z=1.0, dz=0.0), (1.0, 0.0))
+    assert max(np.abs(back[name] - path(back.t)).max() for name in "xyz") < 1e-11
+
+
+def test_models_pickle_with_their_paths(tmp_path):
+    model = followed().with_references(X=0.5 * PATH[0])
+    (tmp_path / "model").write_bytes(pickle.dumps(model))
+    code = (
+        "import pickle, sys, servoctl as sv; m = pickle.load(open(sys.argv[1], 'rb'));"
+        "print(repr(float(sv.simulate(m, m.start(guess={'l': 4.0}), (0.0, 6.0))['trolley'].max())))"
+    )
+    printed = subprocess.run(
+        [sys.executable, "-c", code, tmp_path / "model"], capture_output=True, text=True, check=True
+    )
+    run = sv.simulate(model, model.start(guess=HANGING), (0.0, 6.0))
+    assert float(printed.stdout) == run["trolley"].max()
+
+
+def test_what_is_missing_or_wrong_is_said():
+    mechanism, load = crane()
+    r = mechanism.q.references(X=None, Z=PATH[1])
+    model = sv.derive(mechanism, sv.Program({"X": load[0] - r.X, "Z": load[1] + r.Z}, by="actuators"))
+    with pytest.raises(SpecificationError, match=r"No path was given for X.*model.with_references\(X=\.\.\.\)"):
+        model.start(guess=HANGING)
+    with pytest.raises(NameUnknown, match="No reference is named 'Y'"):
+        model.with_references(Y=PATH[0])
+    with pytest.raises(SpecificationError, match="has 2 components"):
+        model.with_references(X=PATH)
+    open_ended = sv.paths.polynomials([0.0, 6.0], np.array([[1.0], [0.0]]))
+    other = model.with_references(X=open_ended)
+    with pytest.raises(SpecificationError, match="nothing was said of it after t = 6 s"):
+        sv.simulate(other, other.start(guess=HANGING), (0.0, 7.0))
+    mechanism, load = crane()
+    mass = mechanism.q.references(m_load=PATH[0]).m_load
+    with pytest.raises(SpecificationError, match="A reference and a parameter are both named 'm_load'"):
+        sv.derive(mechanism, sv.Program({"X": load[0] - mass, "Z": load[1] + 4}, by="actuators"))
