@@ -24,7 +24,7 @@ from servoctl.jets.pieces import by_pieces
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape
 from servoctl.methods.taylor import TaylorSteps, last_index, series_loop
-from servoctl.spec import paths
+from servoctl.spec.paths import expressions as paths
 
 T, X, P = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RNG = np.random.default_rng(7)

@@ -1,14 +1,13 @@
 """Paths near functions and measurements."""
 
 import functools
-import itertools
 import math
 
 import numpy as np
 
 from servoctl.checks import MOST_JETS, array_of, as_numbers, as_span, positive, positives, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths.makers import samples
+from servoctl.spec.paths.makers import hermite, samples
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import SAME, Path, counted, stacked
 
@@ -86,21 +85,11 @@ def _through_jets(edges, jets, before, after):
 
 @functools.lru_cache(maxsize=64)
 def _from_both_ends(k):
-    """Powers 0 .. 2k + 1 (rows) of the polynomial that has Taylor coefficients 0 .. k at -1, then at 1 (columns).
-
-    That of coefficient j at -1 is (1 + x)^j r^(k + 1) sum_(i=0..k-j) binomial(k + i, i) l^i with l = (1 + x)/2 and
-    r = (1 - x)/2, in whole numbers that are rounded once; those at 1 are its mirror images.
-    """
-    size = 2 * k + 2
-    left = np.zeros((size, k + 1))
-    for j in range(k + 1):
-        powers = [0] * size
-        for i in range(k + 1 - j):
-            for a, b in itertools.product(range(i + j + 1), range(k + 2)):
-                term = math.comb(k + i, i) * math.comb(i + j, a) * math.comb(k + 1, b)
-                powers[a + b] += (-1) ** b * 2 ** (k - j - i) * term
-        left[:, j] = [power / 2 ** (size - 1 - j) for power in powers]
-    return np.concatenate([left, left * (-1.0) ** np.add.outer(np.arange(size), np.arange(k + 1))], axis=1)
+    """Powers 0 .. 2k + 1 (rows) of the polynomial that has Taylor coefficients 0 .. k at -1, then at 1 (columns)."""
+    columns = [hermite(k, j) for j in range(k + 1)]
+    left = np.array([[c / denominator for c in numerators] for numerators, denominator in columns]).T
+    mirrored = (-1.0) ** np.add.outer(np.arange(2 * k + 2), np.arange(k + 1))
+    return np.concatenate([left, left * mirrored], axis=1)
 
 
 def _jets_of(f, t, k):

@@ -1,6 +1,7 @@
 """Paths from ends, points and limits."""
 
 import functools
+import itertools
 import math
 
 import numpy as np
@@ -337,36 +338,43 @@ def _stretched(edges, coefficients, first, last):
 @functools.lru_cache(maxsize=64)
 def _unit_step(k):
     """The step from 0 to 1 of class k over (0, 1), with its cuts: edges (n + 1,), coefficients (n, size)."""
-    return _cut_exactly(*_powers_of_step(k))
+    return _cut_exactly(*_step(k))
 
 
 @functools.lru_cache(maxsize=64)
 def _unit_ramp(k):
     """The integral from 0 of the step of class k - 1, as of `_unit_step`."""
-    numerators, denominator = _powers_of_step(k - 1)
+    numerators, denominator = _step(k - 1)
     multiple = math.lcm(*range(1, len(numerators) + 1))
     powers = [0, *(c * multiple // (j + 1) for j, c in enumerate(numerators))]
     powers[0] = -sum(c * (-1) ** j for j, c in enumerate(powers))
     return _cut_exactly(powers, 2 * denominator * multiple)
 
 
-def _powers_of_step(k):
-    """Whole numerators (size,) by powers of u, which goes from -1 to 1, and the denominator, of the step.
+def _step(k):
+    """The step of class k in the time u from -1 to 1, as of `hermite`."""
+    numerators, denominator = hermite(k, 0)
+    return [c * (-1) ** p for p, c in enumerate(numerators)], denominator
 
-    S = 1/2 + u/2 sum_(j=0..k) binomial(2j, j) ((1 - u^2)/4)^j.
+
+def hermite(k, j):
+    """Whole numerators (2k + 2,) by powers of u, and their denominator, of one polynomial of Hermite.
+
+    Of its Taylor coefficients 0 to k at -1 and at 1 all vanish but number j at -1, which is 1. It is
+    (1 + u)^j r^(k + 1) sum_(i=0..k-j) binomial(k + i, i) l^i with l = (1 + u)/2 and r = (1 - u)/2.
     """
     powers = [0] * (2 * k + 2)
-    powers[0] = 4**k
-    for j in range(k + 1):
-        for i in range(j + 1):
-            powers[2 * i + 1] += math.comb(2 * j, j) * math.comb(j, i) * (-1) ** i * 4 ** (k - j)
-    return powers, 2 * 4**k
+    for i, b in itertools.product(range(k + 1 - j), range(k + 2)):
+        factor = (-1) ** b * 2 ** (k - j - i) * math.comb(k + i, i) * math.comb(k + 1, b)
+        for a in range(i + j + 1):
+            powers[a + b] += factor * math.comb(i + j, a)
+    return powers, 2 ** (2 * k + 1 - j)
 
 
 def _cut_exactly(numerators, denominator):
     """The polynomial in u with rational coefficients on (0, 1), expanded in parts: edges, coefficients (n, size).
 
-    Each coefficient is computed in whole numbers and rounded once.
+    Each is computed in whole numbers and rounded once.
     """
     n, unit = len(numerators) - 1, 2 ** (HALVINGS + 1)  # of u at middles of parts
 
