@@ -338,20 +338,20 @@ def _stretched(edges, coefficients, first, last):
 @functools.lru_cache(maxsize=64)
 def _unit_step(k):
     """The step from 0 to 1 of class k over (0, 1), with its cuts: edges (n + 1,), coefficients (n, size)."""
-    return _cut_exactly(*_step(k))
+    return _cut_exactly(*_step_in_u(k))
 
 
 @functools.lru_cache(maxsize=64)
 def _unit_ramp(k):
     """The integral from 0 of the step of class k - 1, as of `_unit_step`."""
-    numerators, denominator = _step(k - 1)
+    numerators, denominator = _step_in_u(k - 1)
     multiple = math.lcm(*range(1, len(numerators) + 1))
     powers = [0, *(c * multiple // (j + 1) for j, c in enumerate(numerators))]
     powers[0] = -sum(c * (-1) ** j for j, c in enumerate(powers))
     return _cut_exactly(powers, 2 * denominator * multiple)
 
 
-def _step(k):
+def _step_in_u(k):
     """The step of class k in the time u from -1 to 1, as of `hermite`."""
     numerators, denominator = hermite(k, 0)
     return [c * (-1) ** p for p, c in enumerate(numerators)], denominator
