@@ -2,10 +2,11 @@
 
 import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 
-from servoctl.checks import MOST_JETS, array_of, as_numbers, as_span, positive, positives, whole_of
+from servoctl.checks import MOST_JETS, array_of, as_numbers, as_span, positive, positives, require_kind, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.spec.paths.makers import hermite, samples
 from servoctl.spec.paths.scipy_paths import as_path
@@ -48,6 +49,7 @@ def function(f, span, smoothness=4, tolerance=1e-9, *, before=None, after=None):
         or rounding keeps the fit from the tolerance.
     """
     k, tolerance = whole_of("smoothness", smoothness, range(MOST_JETS + 1)), positive("tolerance", tolerance)
+    require_kind(Callable, "f", f, "def f(t): return value, derivative, ...")
     edges, told, best = np.array(as_span(span, forward=True)), {}, math.inf
 
     def jets(t):

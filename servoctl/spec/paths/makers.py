@@ -11,7 +11,7 @@ from servoctl.errors import SpecificationError
 from servoctl.spec.paths import expressions
 from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
 from servoctl.spec.paths.transition import or_expression
-from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending
+from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, vector
 
 
 @or_expression(expressions.rest_to_rest)
@@ -83,7 +83,7 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
     """
     k, t_start = _class(smoothness, least=1), finite("t_start", t_start)
     duration, ramp = positive("duration", duration), positive("ramp", ramp)
-    distance = _point("distance", distance)
+    distance = vector("distance", distance)
     if 2 * ramp > duration:
         raise SpecificationError(
             f"Two ramps of {ramp:g} s do not fit in a duration of {duration:g} s.",
@@ -296,15 +296,11 @@ def _class(k, least=0):
 
 def _ends(start, end):
     """Two points (dim,) of the same size, from numbers or vectors."""
-    start, end = _point("start", start), _point("end", end)
+    start, end = vector("start", start), vector("end", end)
     if len(start) != len(end):
         given, rule = f"start has {len(start)} entries, end has {len(end)}.", "They are vectors of the same size."
         raise SpecificationError(given, rule, start=len(start), end=len(end))
     return start, end
-
-
-def _point(name, value):
-    return array_of(name, np.atleast_1d(as_numbers(value)), None)
 
 
 def _along(breaks, unit, start, end, k, corners=False):

@@ -1,7 +1,5 @@
 """Paths from what SciPy makes."""
 
-import math
-
 import numpy as np
 
 from servoctl.checks import whole_of, without_effect
@@ -90,10 +88,11 @@ def by_derivatives(curve, degree, origin=0.0, unit=1.0):
 
     def expand(low, high):
         middle, half = ((low - origin) + (high - origin)) / 2 / unit, (high - low) / 2 / unit
-        rows = []
+        rows, scale = [], np.ones((len(middle), 1))
         for k in range(degree + 1):
             values = np.moveaxis(np.asarray(curve(middle, nu=k)), curve.axis, 0).reshape(len(middle), -1)
-            rows.append(values / math.factorial(k) * half[:, None] ** k)
+            rows.append(values * scale)
+            scale = scale * half[:, None] / (k + 1)
         return np.stack(rows, axis=2)
 
     return expand

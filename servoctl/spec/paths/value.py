@@ -4,7 +4,7 @@ from dataclasses import field
 
 import numpy as np
 
-from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, whole, whole_of
+from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.values import Value, frozen, read_only
 
@@ -52,7 +52,7 @@ class Path(Value):
         arrays = {"breaks": (None,), "coefficients": (None, None, None), "classes": (None,)}
         for name, sizes in arrays.items():
             array = as_numbers(getattr(self, name)) + 0.0
-            array_of(name, array[np.isfinite(array)] if name == "classes" else array, *sizes)
+            array_of(name, array[array != np.inf] if name == "classes" else array, *sizes)
             self.__dict__[name] = read_only(array)
         pieces, shape = len(self.breaks) - 1, self.coefficients.shape
         if shape[0] != pieces or 0 in shape or len(self.classes) != pieces + 1:
@@ -119,7 +119,7 @@ class Path(Value):
             If t is no finite number or array (N,) of them, the order is no whole number, or an instant lies outside
             a path that neither holds, goes on nor repeats there.
         """
-        t, order = array_of("t", np.atleast_1d(as_numbers(t)), None), whole("order", order, most=MOST_JETS)
+        t, order = vector("t", t), whole("order", order, most=MOST_JETS)
         self._require_known(t, max(order, 1))
         factorials = np.cumprod([1.0, *range(1, order + 1)])
         return (self._taylor(t, order, 1.0) * factorials[:, None, None]).transpose(0, 2, 1)
@@ -179,7 +179,7 @@ class Path(Value):
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
         if not isinstance(other, Path):
-            constant = array_of("the constant added to a path", np.atleast_1d(as_numbers(other)), None)
+            constant = vector("The constant added to a path", other)
             _require_dim(self.dim, len(constant))
             coefficients = self.coefficients.copy()
             coefficients[:, :, 0] += constant
@@ -191,7 +191,7 @@ class Path(Value):
     __radd__ = __add__
 
     def __sub__(self, other):
-        return self + (-other if isinstance(other, Path) else -1.0 * as_numbers(other))
+        return self + (-other if isinstance(other, Path) else -vector("The constant taken from a path", other))
 
     def __rsub__(self, other):
         return -self + other
@@ -214,7 +214,7 @@ class Path(Value):
         SpecificationError
             If the dimensions differ or one of the paths is periodic, and has no end.
         """
-        _require_dim(self.dim, other.dim)
+        _require_dim(self.dim, require_kind(Path, "other", other, "sv.paths.as_path(...)").dim)
         if "periodic" in (self.after, other.before):
             rule, do = "A path follows the end of another one.", "Repeat neither of them."
             raise SpecificationError("A periodic path was joined.", rule, do=do, after=self.after, before=other.before)
@@ -257,8 +257,9 @@ class Path(Value):
         from matplotlib.figure import Figure
 
         t = np.linspace(self.breaks[0], self.breaks[-1], 1001)
-        axes = Figure(figsize=(8.0, 2.0 * order + 2.0), layout="constrained").subplots(order + 1, squeeze=False)[:, 0]
-        for k, values in enumerate(self.jets(t, order)):
+        jets = self.jets(t, order)
+        axes = Figure(figsize=(8.0, 2.0 * len(jets)), layout="constrained").subplots(len(jets), squeeze=False)[:, 0]
+        for k, values in enumerate(jets):
             axes[k].plot(t, values.T)
             axes[k].set_ylabel(f"derivative {k}")
         axes[-1].set_xlabel("t [s]")
@@ -279,6 +280,11 @@ def _require_dim(dim, other):
     if dim != other:
         rule = "Paths are joined component by component."
         raise SpecificationError(f"One has {dim} components, the other {other}.", rule, dimensions=(dim, other))
+
+
+def vector(name, value):
+    """An array (n,) of finite numbers, from one number, too."""
+    return array_of(name, value if as_numbers(value).ndim else [value], None)
 
 
 def require_ascending(name, breaks):
