@@ -47,13 +47,13 @@ def internal(app, what, name, thing, skip, options):
     """Leave out what a module imports, and a class's methods without types that no page and no example names."""
     function = getattr(thing, "fget", None) or getattr(thing, "func", thing)
     if what == "module" and options.imported_members:
-        home = inspect.getmodule(thing)
-        public = any(home is getattr(servoctl, name) for name in servoctl.__all__)
+        home = f"{getattr(inspect.getmodule(thing), '__name__', '')}."
+        public = any(home.startswith(f"{getattr(servoctl, name).__name__}.") for name in servoctl.__all__)
         return None if public and "----" in (thing.__doc__ or "") else True
     if skip or what != "class" or not inspect.isfunction(function):
         return None
     first = function.__qualname__.split(".")[0]
-    homes = (servoctl, servoctl.types, servoctl.methods)
+    homes = (servoctl, servoctl.types, servoctl.methods, servoctl.paths)
     owner = next((getattr(home, first) for home in homes if hasattr(home, first)), None)
     known = re.search(rf"\.{name}\b", USED) or f"`{name}`" in (owner.__doc__ or "")
     return None if function.__annotations__ or known else True

@@ -13,7 +13,8 @@ classes.
 
 from servoctl.spec.paths.expressions import circle, line, piecewise
 from servoctl.spec.paths.fit import fit, function
-from servoctl.spec.paths.makers import polynomials, rest_to_rest, s_curve, spline, trapezoid
+from servoctl.spec.paths.makers import polynomials, rest_to_rest, s_curve, trapezoid
+from servoctl.spec.paths.makers import spline_through as spline
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import Path
 

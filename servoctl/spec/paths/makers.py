@@ -1,6 +1,7 @@
 """Paths from ends, points and limits."""
 
 import functools
+import itertools
 import math
 
 import numpy as np
@@ -10,9 +11,7 @@ from servoctl.errors import SpecificationError
 from servoctl.spec.paths import expressions
 from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
 from servoctl.spec.paths.transition import or_expression
-from servoctl.spec.paths.value import HALVINGS, Path, cut, require_ascending
-
-SHORTEST = 1e-12  # of a motion: phases that are shorter are left out, as they are rounding
+from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, vector
 
 
 @or_expression(expressions.rest_to_rest)
@@ -47,10 +46,8 @@ def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
     k = _class(smoothness)
     start, end = _ends(start, end)
     t_start = finite("t_start", t_start)
-    breaks, step = _stretched(_step(k), t_start, t_start + positive("duration", duration))
-    coefficients = step[:, None] * (end - start)[:, None]
-    coefficients[:, :, 0] += start
-    return _at_rest(breaks, coefficients, k)
+    breaks, step = _stretched(*_unit_step(k), t_start, t_start + positive("duration", duration))
+    return _along(breaks, step, start, end, k)
 
 
 @or_expression(expressions.trapezoid)
@@ -86,7 +83,7 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
     """
     k, t_start = _class(smoothness, least=1), finite("t_start", t_start)
     duration, ramp = positive("duration", duration), positive("ramp", ramp)
-    _, distance = _ends(0.0 * as_numbers(distance), distance)
+    distance = vector("distance", distance)
     if 2 * ramp > duration:
         raise SpecificationError(
             f"Two ramps of {ramp:g} s do not fit in a duration of {duration:g} s.",
@@ -98,18 +95,16 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
         )
     corners = [t_start, t_start + ramp, t_start + duration - ramp, t_start + duration]
     part = ramp / (duration - ramp)  # of the distance: what the cruise would cover twice during a ramp
-    begun, rise = _stretched(_rise(k), *corners[:2])
-    edges, mirrored = _rise(k)
-    fall = -mirrored[::-1] * (-1.0) ** np.arange(mirrored.shape[1])
-    ended, fall = _stretched((1.0 - edges[::-1], fall), *corners[2:])
-    fall = part * fall
+    edges, rise = _unit_ramp(k)
+    fall = -rise[::-1] * (-1.0) ** np.arange(rise.shape[1])
+    begun, rise = _stretched(edges, part * rise, *corners[:2])
+    ended, fall = _stretched(1.0 - edges[::-1], part * fall, *corners[2:])
     fall[:, 0] += 1.0
-    cruises = int(corners[1] < corners[2])
-    cruise = np.zeros((cruises, rise.shape[1]))
+    cruise = np.zeros((int(corners[2] - corners[1] > SAME * np.abs(corners).max()), rise.shape[1]))
     cruise[:, :2] = 0.5, 0.5 - part / 2
-    table = np.concatenate([part * rise, cruise, fall])
-    breaks = np.concatenate([begun, ended[1 - cruises :]])
-    return _at_rest(breaks, table[:, None] * distance[:, None], k, np.isin(breaks, corners))
+    breaks = np.concatenate([begun, ended[1 - len(cruise) :]])
+    table = np.concatenate([rise, cruise, fall])
+    return _along(breaks, table, 0.0 * distance, distance, k, np.isin(breaks, corners))
 
 
 def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
@@ -143,26 +138,22 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     if distance == 0.0:
         rule, do = "They differ.", "Use rest_to_rest for a path that stands still."
         raise SpecificationError(f"start and end are both {end.tolist()}.", rule, do=do, start=end.tolist())
-    limits = {"speed": speed, "acceleration": acceleration, "jerk": jerk}
-    v, a, j = (positive(name, value) for name, value in limits.items())
+    v, a, j = positive("speed", speed), positive("acceleration", acceleration), positive("jerk", jerk)
     rise = min(a / j, math.sqrt(v / j), (distance / (2 * j)) ** (1 / 3))  # of the acceleration, to its largest value
     a = j * rise
-    longest = math.sqrt(rise**2 / 4 + distance / a) - 1.5 * rise  # at this acceleration, if there is no cruise
-    constant = max(0.0, min(v / a - rise, longest))
+    constant = max(0.0, min(v / a - rise, math.sqrt(rise**2 / 4 + distance / a) - 1.5 * rise))  # of the acceleration
     cruise = max(0.0, distance / (a * (rise + constant)) - 2 * rise - constant)
     phases = np.array([rise, constant, rise, cruise, rise, constant, rise])
-    lasting = phases > SHORTEST * phases.sum()
+    lasting = phases > SAME * phases.sum()  # others are rounding
     breaks = np.append(0.0, np.cumsum(phases[lasting]))
-    jerks = j * np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])[lasting]
-    along = as_path(PPoly(jerks[None], breaks).antiderivative(3), smoothness=2)
-    direction = (end - start) / distance
-    coefficients = along.coefficients * direction[:, None]
-    coefficients[:, :, 0] += start
-    return _at_rest(finite("t_start", t_start) + along.breaks, coefficients, 2, np.isfinite(along.classes))
+    jerks = np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])[lasting] * j / distance
+    unit = as_path(PPoly(jerks[None], breaks).antiderivative(3), smoothness=2)
+    table = unit.coefficients[:, 0]
+    return _along(finite("t_start", t_start) + unit.breaks, table, start, end, 2, np.isfinite(unit.classes))
 
 
 @or_expression(expressions.spline)
-def spline(times, points, *, smoothness=2, ends="rest"):
+def spline_through(times, points, *, smoothness=2, ends="rest"):
     """Pass through points at given times along SciPy's interpolating spline.
 
     With `ends="rest"` the spline has degree 2k + 1, k = `smoothness`, and its first k derivatives vanish at both
@@ -208,35 +199,15 @@ def spline(times, points, *, smoothness=2, ends="rest"):
             points=len(times),
             smoothness=k,
         )
-    unit = (times[-1] - times[0]) / (len(times) - 1)
-    vanishing = range(1, m + 1) if rest else range(m + 1, 2 * m + 1)
-    curve = _interpolating((times - times[0]) / unit, points, 2 * m + 1, vanishing)
-    breaks, coefficients, cuts = cut(times, by_derivatives(curve, 2 * m + 1, times[0], unit))
-    _require_passing(coefficients, np.flatnonzero(~cuts), times, points)
-    classes = np.where(cuts, np.inf, 2.0 * m)
-    classes[[0, -1]] = m if rest else np.inf
-    rule = "hold" if rest else "continue"
-    return Path(breaks, coefficients, classes, rule, rule)
-
-
-def _interpolating(x, points, degree, vanishing):
-    """SciPy's spline through points whose derivatives of some orders vanish at both ends; NaN where it finds none."""
-    from scipy.interpolate import BSpline, make_interp_spline
-
-    conditions = [(order, np.zeros(points.shape[1])) for order in vanishing]
+    miss, degree = math.nan, 2 * m + 1
+    vanishing, outside = (range(1, m + 1), "hold") if rest else (range(m + 1, degree), "continue")
     try:
-        return make_interp_spline(x, points, k=degree, bc_type=(conditions, conditions) if conditions else None)
+        path = _interpolating(times, points, vanishing, outside)
+        miss = np.abs(path.jets(times, 0)[0].T - points).max()
     except (ValueError, np.linalg.LinAlgError):  # SciPy's equations are singular for very uneven intervals
-        return BSpline(np.repeat([x[0], x[-1]], degree + 1), np.full((degree + 1, points.shape[1]), np.nan), degree)
-
-
-def _require_passing(coefficients, places, times, points):
-    """Refuse pieces (n, dim, size) that miss points, which lie at these places among their ends."""
-    starts = (coefficients * (-1.0) ** np.arange(coefficients.shape[2])).sum(axis=2)[places[:-1]]
-    stops = coefficients.sum(axis=2)[places[1:] - 1]
-    miss = max(np.abs(starts - points[:-1]).max(), np.abs(stops - points[1:]).max())
+        pass
     if not miss <= expressions.MISSED * np.abs(points).max():
-        degree, ratio = coefficients.shape[2] - 1, np.diff(times).max() / np.diff(times).min()
+        ratio = np.diff(times).max() / np.diff(times).min()
         raise SpecificationError(
             f"The spline of degree {degree} misses its points by {miss:.1e}; its longest interval is {ratio:.3g} times "
             "its shortest.",
@@ -246,6 +217,21 @@ def _require_passing(coefficients, places, times, points):
             miss=miss,
             ratio=ratio,
         )
+    return path
+
+
+def _interpolating(times, points, vanishing, outside):
+    """SciPy's spline through points whose derivatives of m orders vanish at both ends."""
+    from scipy.interpolate import make_interp_spline
+
+    m, unit = len(vanishing), (times[-1] - times[0]) / (len(times) - 1)
+    conditions = [(order, np.zeros(points.shape[1])) for order in vanishing]
+    bc_type = (conditions, conditions) if conditions else None
+    curve = make_interp_spline((times - times[0]) / unit, points, k=2 * m + 1, bc_type=bc_type)
+    breaks, coefficients, cuts = cut(times, by_derivatives(curve, 2 * m + 1, times[0], unit))
+    classes = np.where(cuts, np.inf, 2.0 * m)
+    classes[[0, -1]] = m if outside == "hold" else np.inf
+    return Path(breaks, coefficients, classes, outside, outside)
 
 
 def polynomials(breaks, coefficients, *, smoothness=None, before=None, after=None):
@@ -310,60 +296,50 @@ def _class(k, least=0):
 
 def _ends(start, end):
     """Two points (dim,) of the same size, from numbers or vectors."""
-    points = [array_of(n, np.atleast_1d(as_numbers(v)), None) for n, v in (("start", start), ("end", end))]
-    if points[0].shape != points[1].shape or not points[0].size:
-        given = f"start has {points[0].size} entries, end has {points[1].size}."
-        sizes = {"start": points[0].size, "end": points[1].size}
-        raise SpecificationError(
-            given, "They are numbers or vectors of the same size, with at least one entry.", **sizes
-        )
-    return points
+    start, end = vector("start", start), vector("end", end)
+    if len(start) != len(end):
+        given, rule = f"start has {len(start)} entries, end has {len(end)}.", "They are vectors of the same size."
+        raise SpecificationError(given, rule, start=len(start), end=len(end))
+    return start, end
 
 
-def _at_rest(breaks, coefficients, k, corners=False):
-    """The path of class k at its ends, where it is held, and at corners (n + 1,); other breaks are cuts."""
+def _along(breaks, unit, start, end, k, corners=False):
+    """The path from start to end along polynomials (n, size) from 0 to 1, of class k at its ends and corners (n + 1,).
+
+    It is held outside; other breaks are cuts.
+    """
+    coefficients = unit[:, None] * (end - start)[:, None]
+    coefficients[:, :, 0] += start
     classes = np.where(corners, float(k), np.full(len(breaks), np.inf))
     classes[[0, -1]] = k
     return Path(breaks, coefficients, classes, "hold", "hold")
 
 
-def _stretched(unit, first, last):
+def _stretched(edges, coefficients, first, last):
     """A polynomial on (0, 1), by edges (n + 1,) and coefficients (n, size), between two instants: breaks, coefficients.
 
     Where a cut is rounded in t, the parts beside it are expanded about their rounded ends, to first order.
     """
-    edges, coefficients = unit
     breaks = first + (last - first) * edges
     breaks[-1] = last
     require_ascending("breaks", breaks)
-    ends = [_halves(x) for x in (first, last)]
-    moved = [
-        math.fsum([t, *(-a * (1.0 - e) for a in ends[0]), *(-b * e for b in ends[1])])
-        for t, e in zip(breaks.tolist(), edges.tolist(), strict=True)
-    ]
-    low, high = (np.array(moved[side]) / np.diff(breaks) for side in (slice(-1), slice(1, None)))
+    wide = breaks.astype(np.longdouble)
+    moved = ((wide - wide[0]) - (wide[-1] - wide[0]) * edges).astype(float)
+    low, high = moved[:-1] / np.diff(breaks), moved[1:] / np.diff(breaks)
     powers = np.arange(coefficients.shape[1])
-    slopes = np.zeros_like(coefficients)
-    slopes[:, :-1] = coefficients[:, 1:] * powers[1:]
+    slopes = np.pad(coefficients[:, 1:] * powers[1:], ((0, 0), (0, 1)))
     return breaks, coefficients + (low + high)[:, None] * slopes + (high - low)[:, None] * coefficients * powers
 
 
-def _halves(x):
-    """Two numbers with half the digits of x whose sum it is: their products with edges are exact."""
-    mantissa, exponent = math.frexp(x)
-    high = math.ldexp(round(math.ldexp(mantissa, 26)), exponent - 26)
-    return high, x - high
-
-
 @functools.lru_cache(maxsize=64)
-def _step(k):
+def _unit_step(k):
     """The step from 0 to 1 of class k over (0, 1), with its cuts: edges (n + 1,), coefficients (n, size)."""
     return _cut_exactly(*_step_in_u(k))
 
 
 @functools.lru_cache(maxsize=64)
-def _rise(k):
-    """The integral from 0 of the step of class k - 1, as of `_step`."""
+def _unit_ramp(k):
+    """The integral from 0 of the step of class k - 1, as of `_unit_step`."""
     numerators, denominator = _step_in_u(k - 1)
     multiple = math.lcm(*range(1, len(numerators) + 1))
     powers = [0, *(c * multiple // (j + 1) for j, c in enumerate(numerators))]
@@ -372,22 +348,29 @@ def _rise(k):
 
 
 def _step_in_u(k):
-    """Whole numerators (size,) by powers of u, which goes from -1 to 1, and the denominator, of the step.
+    """The step of class k in the time u from -1 to 1, as of `hermite`."""
+    numerators, denominator = hermite(k, 0)
+    return [c * (-1) ** p for p, c in enumerate(numerators)], denominator
 
-    S = 1/2 + u/2 sum_(j=0..k) binomial(2j, j) ((1 - u^2)/4)^j.
+
+def hermite(k, j):
+    """Whole numerators (2k + 2,) by powers of u, and their denominator, of one polynomial of Hermite.
+
+    Of its Taylor coefficients 0 to k at -1 and at 1 all vanish but number j at -1, which is 1. It is
+    (1 + u)^j r^(k + 1) sum_(i=0..k-j) binomial(k + i, i) l^i with l = (1 + u)/2 and r = (1 - u)/2.
     """
     powers = [0] * (2 * k + 2)
-    powers[0] = 4**k
-    for j in range(k + 1):
-        for i in range(j + 1):
-            powers[2 * i + 1] += math.comb(2 * j, j) * math.comb(j, i) * (-1) ** i * 4 ** (k - j)
-    return powers, 2 * 4**k
+    for i, b in itertools.product(range(k + 1 - j), range(k + 2)):
+        factor = (-1) ** b * 2 ** (k - j - i) * math.comb(k + i, i) * math.comb(k + 1, b)
+        for a in range(i + j + 1):
+            powers[a + b] += factor * math.comb(i + j, a)
+    return powers, 2 ** (2 * k + 1 - j)
 
 
 def _cut_exactly(numerators, denominator):
     """The polynomial in u with rational coefficients on (0, 1), expanded in parts: edges, coefficients (n, size).
 
-    Each coefficient is computed in whole numbers and rounded once.
+    Each is computed in whole numbers and rounded once.
     """
     n, unit = len(numerators) - 1, 2 ** (HALVINGS + 1)  # of u at middles of parts
 

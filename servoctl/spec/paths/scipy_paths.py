@@ -1,11 +1,10 @@
 """Paths from what SciPy makes."""
 
-import math
-
 import numpy as np
 
-from servoctl.checks import array_of, whole_of, without_effect
+from servoctl.checks import whole_of, without_effect
 from servoctl.errors import SpecificationError
+from servoctl.spec.paths.expressions import SMOOTHEST
 from servoctl.spec.paths.value import Path, counted, cut
 
 MOST_COUNTED = 300  # pieces of bare polynomials: among more, rounding of high derivatives looks like their jumps
@@ -39,20 +38,27 @@ def as_path(thing, *, smoothness=None, before=None, after=None):
         If it is none of these, complex or not finite, if the smoothness is missing, or given where it is known.
     """
     if isinstance(thing, Path):
-        without_effect(["smoothness"] * (smoothness is not None), "for a Path, which has its classes")
-        before, after = before or thing.before, after or thing.after
-        classes = thing.classes.copy()
-        if (before, after) != (thing.before, thing.after):
-            classes[[0, -1]] = counted(thing.breaks, thing.coefficients, before, after)[[0, -1]]
-        return Path(thing.breaks, thing.coefficients, classes, before, after, thing.remark)
+        options = {"smoothness": smoothness, "before": before, "after": after}
+        without_effect([name for name, value in options.items() if value is not None], "for a Path, which has its own")
+        return thing
     breaks, degree, known = _knots(thing)
+    if known is not None:
+        without_effect(["smoothness"] * (smoothness is not None), f"for a {type(thing).__name__}, whose class is known")
+    elif smoothness is not None:
+        known = whole_of("smoothness", smoothness, range(-1, SMOOTHEST + 1))
+    elif len(breaks) - 1 > MOST_COUNTED:
+        raise SpecificationError(
+            f"A {type(thing).__name__} of {len(breaks) - 1} pieces was given without its smoothness.",
+            f"The class is counted from coefficients for up to {MOST_COUNTED} pieces: among more, the rounding of high "
+            "derivatives cannot be told from jumps.",
+            do="Give smoothness=k for polynomials of class C^k, or the spline (BSpline, CubicSpline) that they are.",
+            pieces=len(breaks) - 1,
+            most=MOST_COUNTED,
+        )
     if thing.extrapolate == "periodic":
         before, after = before or "periodic", after or "periodic"
-    known = _stated(thing, len(breaks) - 1, known, smoothness)
     breaks, coefficients, cuts = cut(breaks, by_derivatives(thing, degree))
-    classes = np.full(len(breaks), np.inf)
-    found = counted(breaks, coefficients, before, after)
-    classes[~cuts] = found[~cuts]
+    classes = np.where(cuts, np.inf, counted(breaks, coefficients, before, after))
     if known is not None:
         classes[np.flatnonzero(~cuts)[1:-1]] = known
     return Path(breaks, coefficients, classes, before, after)
@@ -74,24 +80,7 @@ def _knots(thing):
         return breaks, thing.k, thing.k - multiplicities[1:-1]
     degree = thing.c.shape[0] - 1
     known = degree - (1 if isinstance(thing, CubicSpline) else 2) if isinstance(thing, CubicHermiteSpline) else None
-    return np.unique(array_of("the breaks", thing.x, None)), degree, known
-
-
-def _stated(thing, pieces, known, smoothness):
-    """The class at inner breaks: that which is known, or was stated; None if it is to be counted."""
-    if known is not None:
-        without_effect(["smoothness"] * (smoothness is not None), f"for a {type(thing).__name__}, whose class is known")
-        return known
-    if smoothness is None and pieces > MOST_COUNTED:
-        raise SpecificationError(
-            f"A {type(thing).__name__} of {pieces} pieces was given without its smoothness.",
-            f"The class is counted from coefficients for up to {MOST_COUNTED} pieces: among more, the rounding of high "
-            "derivatives cannot be told from jumps.",
-            do="Give smoothness=k for polynomials of class C^k, or the spline (BSpline, CubicSpline) that they are.",
-            pieces=pieces,
-            most=MOST_COUNTED,
-        )
-    return None if smoothness is None else whole_of("smoothness", smoothness, range(-1, 101))
+    return np.unique(thing.x), degree, known
 
 
 def by_derivatives(curve, degree, origin=0.0, unit=1.0):
@@ -99,10 +88,11 @@ def by_derivatives(curve, degree, origin=0.0, unit=1.0):
 
     def expand(low, high):
         middle, half = ((low - origin) + (high - origin)) / 2 / unit, (high - low) / 2 / unit
-        rows = []
+        rows, scale = [], np.ones((len(middle), 1))
         for k in range(degree + 1):
             values = np.moveaxis(np.asarray(curve(middle, nu=k)), curve.axis, 0).reshape(len(middle), -1)
-            rows.append(values / math.factorial(k) * half[:, None] ** k)
+            rows.append(values * scale)
+            scale = scale * half[:, None] / (k + 1)
         return np.stack(rows, axis=2)
 
     return expand

@@ -1,16 +1,17 @@
 """Paths as values: polynomials of time between breaks, with their derivatives and the class at each break."""
 
+from dataclasses import field
+
 import numpy as np
 
-from servoctl.checks import MOST_JETS, array_of, as_numbers, is_number, positive, whole, whole_of
+from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.values import Value, frozen, read_only
 
 RULES = ("hold", "continue", "periodic", None)
-SAME = 1e-12  # of the largest instant of a path: breaks that differ by less are one, but for rounding
+SAME = 1e-13  # of the largest instant of a path: breaks that differ by less are one, but for rounding
 COUNTED = 1e-7  # of a derivative's largest value, up to which its jump is rounding: SciPy's monomials of C^9 have 1e-8
-CANCELLING = 16.0  # sum of the terms of a polynomial over its largest value, beyond which it is cut: 4 digits of 2
-SAMPLED = (-1.0, 0.0, 1.0, -0.75, 0.75, -0.5, 0.5, -0.25, 0.25)  # local times at which a derivative is large somewhere
+CANCELLING = 16.0  # sum of the terms of a polynomial over its largest value, beyond which it is cut: four binary digits
 HALVINGS = 8  # of a piece: 256 parts, which a path of class 100 needs at its ends
 
 
@@ -18,9 +19,10 @@ HALVINGS = 8  # of a piece: 256 parts, which a path of class 100 needs at its en
 class Path(Value):
     """A signal that is known with its derivatives: polynomials of time between breaks; made by `sv.paths`.
 
-    `path(t)` is its value, `path.jets(t, order)` has its derivatives, too. Paths are added, subtracted and multiplied
-    by numbers; `path[i]` is one component, and `x, y = path` takes it apart. A path of one component is a scalar: its
-    values have the shape of t. At a break the piece that begins there counts, at the last one the piece that ends.
+    `path(t)` is its value, `jets` has its derivatives, too. Paths are added, subtracted and multiplied by numbers;
+    `then` joins them in time, `at_rate` changes their clock, `plot` draws them. `path[i]` is one component, and
+    `x, y = path` takes it apart. A path of one component is a scalar: its values have the shape of t. At a break the
+    piece that begins there counts, at the last one the piece that ends.
 
     Attributes
     ----------
@@ -43,14 +45,14 @@ class Path(Value):
     classes: np.ndarray
     before: str | None = None
     after: str | None = None
-    remark: str = ""
+    remark: str = field(default="", compare=False)
     __array_ufunc__ = None  # a number of NumPy times a path is a path
 
     def __post_init__(self):
         arrays = {"breaks": (None,), "coefficients": (None, None, None), "classes": (None,)}
         for name, sizes in arrays.items():
             array = as_numbers(getattr(self, name)) + 0.0
-            array_of(name, array[np.isfinite(array)] if name == "classes" else array, *sizes)
+            array_of(name, array[array != np.inf] if name == "classes" else array, *sizes)
             self.__dict__[name] = read_only(array)
         pieces, shape = len(self.breaks) - 1, self.coefficients.shape
         if shape[0] != pieces or 0 in shape or len(self.classes) != pieces + 1:
@@ -119,41 +121,42 @@ class Path(Value):
             If t is no finite number or array (N,) of them, the order is no whole number, or an instant lies outside
             a path that neither holds, goes on nor repeats there.
         """
-        t, order = array_of("t", np.atleast_1d(as_numbers(t)), None), whole("order", order, most=MOST_JETS)
-        first, last, at = self.breaks[0], self.breaks[-1], t if instants is None else np.asarray(instants)
-        held = self._held(at, max(order, 1))
+        t, order = vector("t", t), whole("order", order, most=MOST_JETS)
+        at = t if instants is None else np.asarray(instants, dtype=float)
+        self._require_known(at, max(order, 1))
+        factorials = np.cumprod([1.0, *range(1, order + 1)])
+        return (self._taylor(t, order, 1.0, at) * factorials[:, None, None]).transpose(0, 2, 1)
+
+    def _taylor(self, t, order, unit, at):
+        """Taylor coefficients (order + 1, N, dim) at t (N,), for a time in a unit (N,) or one [s].
+
+        Of the pieces at instants (N,).
+        """
+        first, last = self.breaks[[0, -1]]
+        held = (at < first) & (self.before in ("hold", None)) | (at > last) & (self.after in ("hold", None))
         if self.before == "periodic":
             turns = np.floor((at - first) / (last - first)) * (last - first)
             t, at = t - turns, at - turns
-        t, pieces = np.where(held, at.clip(first, last), t), self._pieces(at)
+        t = np.where(held, at.clip(first, last), t)
+        pieces = (np.searchsorted(self.breaks, at, "right") - 1).clip(0, len(self.breaks) - 2)
         low, high = self.breaks[pieces], self.breaks[pieces + 1]
-        jets = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
-        jets[1:, held] = 0.0
-        for k in range(1, order + 1):
-            jets[k:] *= (k / ((high - low) / 2))[:, None]
-        return jets.transpose(0, 2, 1)
+        result = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
+        result[1:, held] = 0.0
+        return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
-    def _pieces(self, t):
-        """The piece (N,) that counts at each instant, the first and the last one outside."""
-        return (np.searchsorted(self.breaks, t, "right") - 1).clip(0, len(self.breaks) - 2)
-
-    def _held(self, t, order):
-        """Where (N,) the path stands still outside its breaks; refused if a derivative up to `order` would be lost."""
-        held = np.zeros(t.shape, dtype=bool)
+    def _require_known(self, t, order):
+        """Refuse instants (N,) outside, if nothing was said and derivatives up to `order` do not vanish at the end."""
         for end, rule, outside in ((0, self.before, t < self.breaks[0]), (-1, self.after, t > self.breaks[-1])):
             if rule is None and outside.any() and self.classes[end] < order:
-                instant, least = t[outside][0], min(order, self.classes[end] + 1)
+                first, last, instant = *self.breaks[[0, -1]], t[outside][0]
                 raise SpecificationError(
-                    f"The path from t = {self.breaks[0]:g} to {self.breaks[-1]:g} s is asked for at t = {instant:g} s.",
-                    f"Nothing was said of it there, and its derivative {least:g} does not vanish at the end, so "
-                    "that it cannot be held.",
+                    f"The path from t = {first:g} to {last:g} s is asked for at t = {instant:g} s.",
+                    f"It can be held only where its derivatives vanish: derivative {self.classes[end] + 1:g} does not.",
                     f"t = {self.breaks[end]:g} s.",
                     f"Stay inside, or make it with {'after' if end else 'before'}='hold' or 'continue'.",
                     t=float(instant),
                     end=float(self.breaks[end]),
                 )
-            held |= outside & (rule in ("hold", None))
-        return held
 
     def held(self):
         """The path that is held outside where nothing was said of it."""
@@ -187,12 +190,9 @@ class Path(Value):
         return Path, (self.breaks, self.coefficients, self.classes, self.before, self.after, self.remark)
 
     def __mul__(self, factor):
-        return self._with(coefficients=self.coefficients * float(factor)) if is_number(factor) else NotImplemented
+        return self._with(coefficients=self.coefficients * finite("factor", factor, "multiple of a path"))
 
     __rmul__ = __mul__
-
-    def __truediv__(self, divisor):
-        return self * (1.0 / divisor) if is_number(divisor) else NotImplemented
 
     def __neg__(self):
         return self * -1.0
@@ -200,7 +200,7 @@ class Path(Value):
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
         if not isinstance(other, Path):
-            constant = array_of("the constant added to a path", np.atleast_1d(as_numbers(other)), None)
+            constant = vector("The constant added to a path", other)
             _require_dim(self.dim, len(constant))
             coefficients = self.coefficients.copy()
             coefficients[:, :, 0] += constant
@@ -212,7 +212,7 @@ class Path(Value):
     __radd__ = __add__
 
     def __sub__(self, other):
-        return self + (-other if isinstance(other, Path) else -1.0 * as_numbers(other))
+        return self + (-other if isinstance(other, Path) else -vector("The constant taken from a path", other))
 
     def __rsub__(self, other):
         return -self + other
@@ -235,17 +235,16 @@ class Path(Value):
         SpecificationError
             If the dimensions differ or one of the paths is periodic, and has no end.
         """
-        _require_dim(self.dim, other.dim)
+        _require_dim(self.dim, require_kind(Path, "other", other, "sv.paths.as_path(...)").dim)
         if "periodic" in (self.after, other.before):
             rule, do = "A path follows the end of another one.", "Repeat neither of them."
             raise SpecificationError("A periodic path was joined.", rule, do=do, after=self.after, before=other.before)
         breaks = np.append(self.breaks, other.breaks[1:] + (self.breaks[-1] - other.breaks[0]))
         coefficients = np.concatenate(of_one_degree(self.coefficients, other.coefficients))
         joint = len(self.breaks) - 1
-        near = slice(joint - 1, joint + 1)
-        found = counted(breaks[joint - 1 : joint + 2], coefficients[near], sizes=largest_terms(breaks, coefficients))[1]
-        resting = min(self.classes[-1], other.classes[0]) if self.after != "continue" != other.before else -1
-        joined = max(found, resting) if found >= 0 else found
+        found = counted(breaks, coefficients)[joint]
+        at_rest = -1 if "continue" in (self.after, other.before) else min(self.classes[-1], other.classes[0])
+        joined = max(found, at_rest) if found >= 0 else found
         classes = np.concatenate([self.classes[:-1], [joined], other.classes[1:]])
         return Path(breaks, coefficients, classes, self.before, other.after)
 
@@ -281,34 +280,32 @@ class Path(Value):
         t = np.linspace(self.breaks[0], self.breaks[-1], 1001)
         jets = self.jets(t, order)
         axes = Figure(figsize=(8.0, 2.0 * len(jets)), layout="constrained").subplots(len(jets), squeeze=False)[:, 0]
-        for k, (panel, values) in enumerate(zip(axes, jets, strict=True)):
-            panel.plot(t, values.T)
-            panel.set_ylabel(f"derivative {k}" if k else "path")
+        for k, values in enumerate(jets):
+            axes[k].plot(t, values.T)
+            axes[k].set_ylabel(f"derivative {k}")
         axes[-1].set_xlabel("t [s]")
         return axes
 
     def __repr__(self):
-        inner = self.classes[1:-1]
-        breaks, lowest = int(np.isfinite(inner).sum()), inner.min(initial=np.inf)
-        between = f", class {lowest:g} at {breaks} breaks" if breaks else ""
-        sides = ("before", self.before, 0), ("after", self.after, -1)
-        ends = ", ".join(f"{side} it: {_in_words(rule, self.classes[end])}" for side, rule, end in sides)
-        components = f"{self.dim} component{'s' * (self.dim > 1)}"
-        span = f"t = {self.breaks[0]:g} .. {self.breaks[-1]:g} s"
-        text = f"Path: {components}, {span}, degree {self.coefficients.shape[2] - 1}{between}\n  {ends}"
+        span = f"Path: {self.dim} component{'s' * (self.dim > 1)}, t = {self.breaks[0]:g} .. {self.breaks[-1]:g} s"
+        lowest, many = self.classes[1:-1].min(initial=np.inf), int(np.isfinite(self.classes[1:-1]).sum())
+        between = f", class {lowest:g} at {many} break{'s' * (many > 1)}" * bool(many)
+        does = {"continue": "goes on", "periodic": "repeats", "hold": "held", None: "held if at rest"}
+        sides = ("before", self.before, self.classes[0]), ("after", self.after, self.classes[-1])
+        ends = ", ".join(f"{side}: {does[rule]}" + f" (class {c:g})" * bool(c < np.inf) for side, rule, c in sides)
+        text = f"{span}, degree {self.coefficients.shape[2] - 1}{between}\n  {ends}"
         return text + f"\n  {self.remark}" * bool(self.remark)
-
-
-def _in_words(rule, class_):
-    """What a path does outside one of its ends, at which it has a class."""
-    meaning = {"continue": "goes on", "periodic": "repeats", "hold": "held", None: "held where it may be"}[rule]
-    return meaning + (f" (class {class_:g})" if class_ < np.inf else "")
 
 
 def _require_dim(dim, other):
     if dim != other:
         rule = "Paths are joined component by component."
         raise SpecificationError(f"One has {dim} components, the other {other}.", rule, dimensions=(dim, other))
+
+
+def vector(name, value):
+    """An array (n,) of finite numbers, from one number, too."""
+    return array_of(name, value if as_numbers(value).ndim else [value], None)
 
 
 def require_ascending(name, breaks):
@@ -338,24 +335,20 @@ def taylor_at(breaks, coefficients, tau):
     """Taylor coefficients (size, n, dim) of all pieces at one local time, in units of half their mean length."""
     n, _, size = coefficients.shape
     lengths = np.diff(breaks)
-    unit = (lengths.mean() / lengths) ** np.arange(size)[:, None]
-    return taylor(coefficients, np.arange(n), np.full(n, float(tau)), size - 1) * unit[:, :, None]
+    with np.errstate(over="ignore", invalid="ignore"):  # of the shortest of very uneven pieces
+        unit = (lengths.mean() / lengths) ** np.arange(size)[:, None]
+        return taylor(coefficients, np.arange(n), np.full(n, float(tau)), size - 1) * unit[:, :, None]
 
 
-def largest_terms(breaks, coefficients):
-    """The largest sum of absolute terms of each derivative, (size, dim), in the unit of `taylor_at`."""
-    return taylor_at(breaks, np.abs(coefficients), 1.0).max(axis=1)
-
-
-def counted(breaks, coefficients, before=None, after=None, sizes=None):
+def counted(breaks, coefficients, before=None, after=None):
     """The classes (n + 1,) at breaks, as far as derivatives agree up to `COUNTED` of their sizes."""
     starts, stops = (taylor_at(breaks, coefficients, tau) for tau in (-1.0, 1.0))
     jumps = np.concatenate([starts[:, :1], starts[:, 1:] - stops[:, :-1], stops[:, -1:]], axis=1)
     jumps[0, [0, -1]] = 0.0  # at the ends: how many derivatives vanish
     if before == "periodic":
         jumps[:, [0, -1]] = starts[:, :1] - stops[:, -1:]
-    sizes = largest_terms(breaks, coefficients) if sizes is None else sizes
-    agree = (np.abs(jumps) <= COUNTED * sizes[:, None]).all(axis=2)
+    sizes = taylor_at(breaks, np.abs(coefficients), 1.0).max(axis=1, keepdims=True)
+    agree = (np.abs(jumps) <= COUNTED * sizes).all(axis=2)
     agree[:, [0, -1]] |= [before == "continue", after == "continue"]
     return np.where(agree.all(axis=0), np.inf, agree.argmin(axis=0) - 1.0)
 
@@ -371,7 +364,7 @@ def cut(breaks, expand):
     for _ in range(HALVINGS):
         terms = taylor_at(breaks, np.abs(coefficients), 1.0)
         values = 0.0
-        for tau in SAMPLED:
+        for tau in (-1.0, 0.0, 1.0, -0.75, 0.75, -0.5, 0.5, -0.25, 0.25):
             values = np.maximum(values, np.abs(taylor_at(breaks, coefficients, tau)).max(axis=1))
             large = (terms > CANCELLING * values[:, None]).any(axis=(0, 2))
             if not large.any():
@@ -387,70 +380,36 @@ def cut(breaks, expand):
 def of_one_degree(*tables):
     """Coefficients (n, dim, size) of several tables, filled up with zeros to one size."""
     size = max(c.shape[2] for c in tables)
-    return [np.concatenate([c, np.zeros((*c.shape[:2], size - c.shape[2]))], axis=2) for c in tables]
+    return [np.pad(c, ((0, 0), (0, 0), (0, size - c.shape[2]))) for c in tables]
 
 
 def together(*paths):
-    """Coefficients of several paths on common breaks, and what else their sum or stack has, by name of `Path`."""
-    rules = [_common_rule(paths, side) for side in ("before", "after")]
-    ends = [[p.breaks[end] for p in paths] for end in (0, -1)]
-    if "periodic" in rules and (np.ptp(ends, axis=1) > SAME * np.abs(ends).max()).any():
-        spans = ", ".join(f"{a:g} .. {b:g}" for a, b in zip(*ends, strict=True))
-        raise SpecificationError(f"Periodic paths have the spans {spans}.", "They have one period.", spans=spans)
-    breaks = np.concatenate([p.breaks for p in paths])
-    low, high = breaks.min(), breaks.max()
-    more = [low - (high - low)] * _differ(paths, "before") + [high + (high - low)] * _differ(paths, "after")
-    breaks = np.unique(np.append(breaks, more))
-    breaks = breaks[np.append(True, np.diff(breaks) > SAME * np.abs(breaks).max())]
-    classes = np.min([_classes_at(p, breaks) for p in paths], axis=0)
-    tables = of_one_degree(*(_between(p, breaks) for p in paths))
-    return tables, {"breaks": breaks, "classes": classes, "before": rules[0], "after": rules[1]}
+    """Coefficients of several paths on common breaks, and what else their sum or stack has, by name of `Path`.
+
+    What they do outside they do together, if they all do it.
+    """
+    breaks = np.unique(np.concatenate([p.breaks for p in paths]))
+    near = SAME * np.abs(breaks).max()
+    spans = [p.breaks[[0, -1]] for p in paths]
+    if {p.before for p in paths} > {"periodic"} or paths[0].before == "periodic" and np.ptp(spans, axis=0).max() > near:
+        given = ", ".join(f"{a:g} .. {b:g} s ({p.before})" for (a, b), p in zip(spans, paths, strict=True))
+        rule = "A periodic path is joined to others of the same period."
+        raise SpecificationError(f"The spans of the paths are {given}.", rule, spans=spans)
+    breaks = breaks[np.append(True, np.diff(breaks) > near)]
+    half, classes = np.diff(breaks) / 2, np.full(len(breaks), np.inf)
+    middles = breaks[:-1] + half
+    tables = [p._taylor(middles, p.coefficients.shape[2] - 1, half, middles).transpose(1, 2, 0) for p in paths]
+    tables = of_one_degree(*tables)
+    for p in paths:
+        p._require_known(middles, 1)
+        np.minimum.at(classes, np.searchsorted(breaks, p.breaks, "right") - 1, p.classes)
+    sides = [p.before for p in paths], [p.after for p in paths]
+    before, after = (rules[0] if len({*rules}) == 1 else None for rules in sides)
+    classes[[0, -1]] = counted(breaks, np.concatenate(tables, axis=1), before, after)[[0, -1]]
+    return tables, {"breaks": breaks, "classes": classes, "before": before, "after": after}
 
 
 def stacked(*paths):
     """One path with the components of several, on common breaks, each of the lowest of their classes."""
     tables, fields = together(*paths)
     return Path(coefficients=np.concatenate(tables, axis=1), **fields)
-
-
-def _differ(paths, side):
-    """Whether some of the paths go on and others stand still, before or after."""
-    rules = {getattr(p, side) for p in paths}
-    return "continue" in rules and len(rules) > 1
-
-
-def _common_rule(paths, side):
-    """What several paths do together before or after."""
-    rules = {getattr(p, side) for p in paths}
-    if "periodic" in rules and len(rules) > 1:
-        given = f"{side.capitalize()} their breaks one path repeats, another one does not."
-        rule, do = "Periodic paths are added to periodic ones.", "Make both with before='periodic', after='periodic'."
-        raise SpecificationError(given, rule, do=do, side=side)
-    return "continue" if "continue" in rules else None if None in rules else rules.pop()
-
-
-def _classes_at(path, breaks):
-    """The class of a path at breaks, among which its own are; infinity at the others."""
-    classes = np.full(len(breaks), np.inf)
-    nearest = np.abs(breaks - path.breaks[:, None]).argmin(axis=1)
-    np.minimum.at(classes, nearest, path.classes)
-    return classes
-
-
-def _between(path, breaks):
-    """Coefficients (n, dim, size) of a path between breaks, among which its own are."""
-    low, high = breaks[:-1], breaks[1:]
-    middle = (low + high) / 2
-    pieces, held = path._pieces(middle), path._held(middle, 1)
-    a, b = path.breaks[pieces], path.breaks[pieces + 1]
-    tau = ((middle - a) + (middle - b)) / (b - a)
-    powers = np.arange(path.coefficients.shape[2])[:, None]
-    parts = (
-        taylor(path.coefficients, pieces, tau, powers[-1, 0])
-        * ((high - low) / (b - a))[None, :, None] ** powers[:, :, None]
-    )
-    parts = parts.transpose(1, 2, 0)
-    parts[held] = 0.0
-    for end, outside in ((path.breaks[0], middle < path.breaks[0]), (path.breaks[-1], middle > path.breaks[-1])):
-        parts[held & outside, :, 0] = path.jets(end, 0)[0, :, 0]
-    return parts
