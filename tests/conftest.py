@@ -11,9 +11,7 @@ import sys
 import warnings
 from pathlib import Path
 
-os.environ.setdefault(
-    "OMP_NUM_THREADS", "1"
-)  # read when casadi is imported; matrices are small, and threads would wait
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when casadi is imported; matrices are small, and threads would wait
 
 import casadi as ca
 import numpy as np
@@ -122,9 +120,7 @@ def pendulum(unit=1.0, guess=True):
     return sv.derive(mechanism, program, guess={"y": -unit} if guess else {}, keep=["x", "y"])
 
 
-lean = pytest.mark.skipif(
-    not hasattr(ca.GlobalOptions, "getNumpyMode"), reason="CasADi before 3.8 merges fewer operations"
-)
+lean = pytest.mark.skipif(not hasattr(ca.GlobalOptions, "getNumpyMode"), reason="CasADi before 3.8 merges fewer operations")
 
 
 def needs(module):
@@ -198,9 +194,7 @@ def pytest_configure(config):
     tier, folder = config.option.tier, config.invocation_params.dir
     every = all(TESTS.is_relative_to(os.path.abspath(folder / argument)) for argument in config.args)
     if not every and tier in ("second", "third"):
-        raise pytest.UsageError(
-            f"--{tier} takes its tests from lists; a file or test that is named is run whole without it."
-        )
+        raise pytest.UsageError(f"--{tier} takes its tests from lists; a file or test that is named is run whole without it.")
     config.stash[TIER] = tier if every else "all"
 
 
@@ -247,7 +241,5 @@ def pytest_terminal_summary(terminalreporter, config):
     """Say what the first tier left."""
     if config.stash[TIER] == "first":
         files = sum("::" not in name for name in LEFT)
-        left = (
-            f"{config.stash.get(FURTHER, 0)} cases that are slow or further ones of their functions, and {files} files"
-        )
+        left = f"{config.stash.get(FURTHER, 0)} cases that are slow or further ones of their functions, and {files} files"
         terminalreporter.write_line(f"This is the first tier of the tests; left to pytest --all: {left}.")

@@ -163,9 +163,7 @@ def six_axis_arm(run):
             place = place + rotation @ np.array(joint.split(), float)
             angle = lift if name == "lift" else HOME[name]
             c, s = cos(angle), sin(angle)
-            rotation = rotation @ (
-                [[c, -s, 0], [s, c, 0], [0, 0, 1]] if axis == "0 0 1" else [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-            )
+            rotation = rotation @ ([[c, -s, 0], [s, c, 0], [0, 0, 1]] if axis == "0 0 1" else [[c, 0, s], [0, 1, 0], [-s, 0, c]])
             total += mass * GRAVITY * (place + rotation @ np.array(centre.split(), float))[2]
         return total
 

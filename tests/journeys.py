@@ -30,10 +30,7 @@ METHODS = "Taylor", "RadauIIA", "RK4", "RK8", "RK45", "DOP853", "Radau", "LSODA"
 OPTIONS = (  # of J5, beside the commands of the pages
     *(f"run cart-pole --method {method} --no-figures" for method in METHODS),
     *(f"run mass-on-car --drift {drift} --no-figures" for drift in ("none", "project", "0.1")),
-    *(
-        f"run overhead-crane --law {law} --rate 200 --delay 1 --no-figures"
-        for law in ("lqr", "computed", "feedforward")
-    ),
+    *(f"run overhead-crane --law {law} --rate 200 --delay 1 --no-figures" for law in ("lqr", "computed", "feedforward")),
     "run overhead-crane --integral --noise x=1e-3 --seed 1 --limit trolley=-200:200 --machine m_load=110 --no-figures",
     "run overhead-crane --accuracy 1e-6 --samples 51 --verbose --animate",
     "run pendubot --t-span 0 1 --hold q2=0.1 --guess dq2=0.1 --no-loop --no-verify",

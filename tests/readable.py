@@ -23,9 +23,7 @@ def _texts(figure):
              for label in (tick.label1, tick.label2)}  # fmt: skip
     hidden = ticks - drawn
     hidden |= {part for ax in figure.axes if not ax.axison for axis in _axes(ax) for part in axis.findobj(Text)}
-    found = [
-        text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip() and text not in hidden
-    ]
+    found = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip() and text not in hidden]
     return [(text.get_text(), text.get_window_extent()) for text in found]
 
 
@@ -43,8 +41,6 @@ def _overlap(a, b):
 
 
 def _empty(ax):
-    return (
-        ax.axison
-        and ax.get_visible()
-        and not any(artist.get_visible() for artist in (*ax.lines, *ax.collections, *ax.patches, *ax.images))
+    return ax.axison and ax.get_visible() and not any(
+        artist.get_visible() for artist in (*ax.lines, *ax.collections, *ax.patches, *ax.images)
     )

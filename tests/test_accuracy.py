@@ -49,11 +49,7 @@ def test_the_motion_is_as_accurate_as_asked(name, accuracy, independent):
     assert run.method == "Taylor" and "two tolerances agree" in run.message
     assert rule.motion_error(model, run.jets, exact.jets) <= accuracy
     coarse = sv.simulate(
-        model,
-        start,
-        gallery[name].t_span,
-        sv.methods.Adaptive("RK45", rtol=1e-2, atol=1e-2),
-        t_eval=times(gallery[name]),
+        model, start, gallery[name].t_span, sv.methods.Adaptive("RK45", rtol=1e-2, atol=1e-2), t_eval=times(gallery[name])
     )
     assert rule.motion_error(model, coarse.jets, exact.jets) > 1e-9  # the measure tells a coarse motion
 
@@ -220,9 +216,7 @@ def test_stiff_motions_are_integrated_implicitly(damping, stiffness, end, method
     assert np.abs(plain["y"] - expected).max() <= 1e-6 * np.abs(expected).max()
     if method == "RadauIIA":
         assert "stability, not accuracy, limits the steps of Taylor" in plain.message
-        explicit = sv.simulate(
-            model, run.state(0.0), (0.0, end), sv.methods.Taylor(rtol=1e-9, atol=1e-9), drift="project"
-        )
+        explicit = sv.simulate(model, run.state(0.0), (0.0, end), sv.methods.Taylor(rtol=1e-9, atol=1e-9), drift="project")
         assert explicit.counters["steps"] > 10 * run.counters["steps"]
 
 

@@ -136,15 +136,9 @@ def test_shapes_count_for_equality_and_survive_a_pickle(crane):
     ("shapes", "facts"),
     [
         (lambda q, p: {"rope": []}, {"name": "rope"}),
-        (
-            lambda q, p: {"rope": [(q["x"], 0), (0, 0, 0)]},
-            {"what": "The shape 'rope', point 2,", "entries": 3, "sizes": (2,)},
-        ),
+        (lambda q, p: {"rope": [(q["x"], 0), (0, 0, 0)]}, {"what": "The shape 'rope', point 2,", "entries": 3, "sizes": (2,)}),
         (lambda q, p: {"rope": [q["x"]]}, {"entries": 1, "sizes": (2, 3)}),
-        (
-            lambda q, p: {"rope": [(q["x"], 0)], "far": [(0, 0, 0)]},
-            {"what": "The shape 'far', point 1,", "sizes": (2,)},
-        ),
+        (lambda q, p: {"rope": [(q["x"], 0)], "far": [(0, 0, 0)]}, {"what": "The shape 'far', point 1,", "sizes": (2,)}),
         (lambda q, p: {"rope": [(q.d(1)[0], 0)]}, {"what": "The shape 'rope'", "order": 1, "limit": 0}),
         (lambda q, p: {"rope": [(ca.SX.sym("y"), 0)]}, {"name": "y"}),
         (lambda q, p: {"rope": [(np.nan, 0)]}, {}),
@@ -308,9 +302,7 @@ def test_films_are_written_by_ffmpeg(crane, tmp_path, monkeypatch):
     with refused(ServoError, "ffmpeg"):
         shown.save(tmp_path / "crane.mp4")
     program = tmp_path / "ffmpeg"
-    program.write_text(
-        '#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\necho "$@" > "$last.txt"\n', encoding="utf-8"
-    )
+    program.write_text('#!/bin/sh\nfor last; do :; done\n/bin/cat > "$last"\necho "$@" > "$last.txt"\n', encoding="utf-8")
     program.chmod(program.stat().st_mode | stat.S_IEXEC)
     raw = shown.save(tmp_path / "crane.mp4").read_bytes()
     words = (tmp_path / "crane.mp4.txt").read_text(encoding="utf-8").split()
@@ -333,11 +325,7 @@ def test_a_mechanism_without_shapes_is_shown_by_its_positions():
     p, q = sv.parameters(m=2.0, g=9.81), sv.coordinates("x z")  # z down
     x, z = q
     mechanism = sv.Mechanism(
-        q,
-        gibbs=sv.particle(q, p.m, ca.vertcat(x, z)),
-        potential=-p.m * p.g * z,
-        actuators={"a": x, "b": z},
-        parameters=p,
+        q, gibbs=sv.particle(q, p.m, ca.vertcat(x, z)), potential=-p.m * p.g * z, actuators={"a": x, "b": z}, parameters=p
     )
     model = sv.derive(mechanism, sv.Program({"X": x - q.t, "Z": z - q.t**2}, by="actuators"))
     shown = sv.figures.animate(sv.simulate(model, model.start(), (0.0, 1.0)), fps=10)
@@ -365,9 +353,7 @@ def test_poses_that_would_hide_each_other_are_side_by_side(reach, apart):
     turn, x = q
     rim = [ca.vertcat(x + ca.cos(turn + a), ca.sin(turn + a), 0) for a in np.linspace(0.0, 2 * np.pi, 9)]
     shapes = {"rim": rim, "spoke": [ca.vertcat(x, 0, 0), rim[0]]}
-    S = sv.particle(q, 1.0, x) + sv.rigid_body(
-        q, 1.0, (0, 0, 1.0), position=ca.vertcat(x, 0, 0), rates=(0, 0, q.d(1)[0])
-    )
+    S = sv.particle(q, 1.0, x) + sv.rigid_body(q, 1.0, (0, 0, 1.0), position=ca.vertcat(x, 0, 0), rates=(0, 0, q.d(1)[0]))
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"M": turn, "F": x}, shapes=shapes)
     program = sv.Program({"turns": turn - np.pi * q.t, "goes": x - reach * q.t}, by="actuators")
     model = sv.derive(mechanism, program)
@@ -407,10 +393,7 @@ def test_what_cannot_be_animated_is_refused(crane, loop, tmp_path):
 @pytest.mark.parametrize(("name", "base"), [("six_axis_arm", "fixed"), ("quadruped", "free"), ("scara", "fixed")])
 def test_a_robot_is_drawn_by_its_frames(name, base):
     robot = sv.urdf(robots.file_of(name), base=base)
-    mechanism, posture = (
-        robot.mechanism(friction=0.0),
-        {q: 0.1 * i for i, q in enumerate(robot.joints) if q in robot.q.names},
-    )
+    mechanism, posture = robot.mechanism(friction=0.0), {q: 0.1 * i for i, q in enumerate(robot.joints) if q in robot.q.names}
     shapes = moved(mechanism, [0.0], robot.posture(posture)[:, None], robot.parameters.values({}))
     assert set(shapes) < set(robot.links)  # all but the root
     for link, points in shapes.items():

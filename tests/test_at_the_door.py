@@ -341,8 +341,6 @@ def test_a_least_cost_of_zero_is_a_minimum(first, minimise):
     p, q = sv.parameters(a=first), sv.coordinates("x")
     (x,) = q
     way = (p.a - 0.1) * sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0, smoothness=4)
-    model = sv.derive(
-        sv.Mechanism(q, sv.particle(q, 1.0, x), actuators={"F": x}, parameters=p), sv.Program({"X": x - way})
-    )
+    model = sv.derive(sv.Mechanism(q, sv.particle(q, 1.0, x), actuators={"F": x}, parameters=p), sv.Program({"X": x - way}))
     found = sv.design(model, {"a": (-1.0, 1.0)}, (0.0, 2.0), minimise)
     assert "a local minimum" in found.message and found.values["a"] == pytest.approx(0.1, abs=1e-7)

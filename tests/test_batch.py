@@ -222,9 +222,7 @@ def test_lost_states_and_commands_are_dated_at_their_samples(plan):
         with pytest.raises(sv.errors.ServoError) as caught:
             sv.close(sv.plant(CRANE, damping={"x": damping[i]}, limits=plant.limits), law, x0, span, timing=timing)
         assert f"t = {caught.value.details['t']:.6g} s" in many["message"][i]
-    assert relative(many.trace["x"][:, 0], one["x"]) < 1e-10 and np.array_equal(
-        many.trace["x"][:, 0], many.trace["x"][:, 4]
-    )
+    assert relative(many.trace["x"][:, 0], one["x"]) < 1e-10 and np.array_equal(many.trace["x"][:, 0], many.trace["x"][:, 4])
 
 
 def test_cases_keep_their_seeds_when_there_are_more(plan):
@@ -293,14 +291,10 @@ def test_sine_and_cosine_of_the_lanes_are_within_two_units(n):
     x = ca.SX.sym("x", 1)
     f = ca.Function("f", [ca.SX.sym("t"), x, ca.SX(0, 1)], [ca.vertcat(ca.sin(x), ca.cos(x))])
     unit = f"#define W_LANES {n}\n{emit.unit({'NAME': 'sines'})}{emit.include('lanes.h')}"
-    text = (
-        unit
-        + emit.function(f, "circular", emit.LANES)
-        + (
-            "void all(int64_t n, const double *a, double *y)\n{\n    for (int64_t k = 0; k < n; k += W_LANES) {\n"
-            "        W v[2], w = *(const U *)(a + k);\n        circular(w, &w, &w, v);\n"
-            "        *(U *)(y + k) = v[0];\n        *(U *)(y + n + k) = v[1];\n    }\n}\n"
-        )
+    text = unit + emit.function(f, "circular", emit.LANES) + (
+        "void all(int64_t n, const double *a, double *y)\n{\n    for (int64_t k = 0; k < n; k += W_LANES) {\n"
+        "        W v[2], w = *(const U *)(a + k);\n        circular(w, &w, &w, v);\n"
+        "        *(U *)(y + k) = v[0];\n        *(U *)(y + n + k) = v[1];\n    }\n}\n"
     )
     library = compiler.library(text, level="-O3")
     y = np.empty((2, len(a)))

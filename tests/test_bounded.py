@@ -128,9 +128,7 @@ def test_it_is_a_forward_motion_where_the_internal_dynamics_are_stable():
     assert whole.t[0] == 0.0 and whole.t[-1] > 3.0  # nothing to do ahead of it
 
 
-@pytest.mark.parametrize(
-    "make, span", [(lambda: arm(0.5), (0.0, 2.0)), (aircraft, (0.0, 3.0))], ids=["arm", "aircraft"]
-)
+@pytest.mark.parametrize("make, span", [(lambda: arm(0.5), (0.0, 2.0)), (aircraft, (0.0, 3.0))], ids=["arm", "aircraft"])
 def test_the_error_of_the_window_falls_with_its_length(make, span):
     model = make()
     errors, said = [], []
@@ -267,9 +265,7 @@ def stiff_forces(damping, stiffness):
     return lambda x, v: (25 * x[1] + x[0], -damping * v[2] - stiffness * x[2] + x[0])
 
 
-@pytest.mark.parametrize(
-    "damping, stiffness", [(8e3, 8e4), (1e3, 1e9), (-2e3, -1e4)], ids=["stiff", "vibrates", "grows"]
-)
+@pytest.mark.parametrize("damping, stiffness", [(8e3, 8e4), (1e3, 1e9), (-2e3, -1e4)], ids=["stiff", "vibrates", "grows"])
 def test_stiff_modes_beside_an_unstable_one(damping, stiffness):
     """They need no more intervals than their layers beside corners, and the others have their closed form."""
     model = masses(stiff_forces(damping, stiffness), follows)
@@ -293,12 +289,8 @@ def test_a_program_of_accelerations_has_no_invariants():
     )
     run = sv.simulate(model, model.start(), (0.0, 1.0), sv.methods.Bounded())
     assert not invariant_names(model) and sv.verify(run).passed
-    assert run.state(run.t[0])[1] == pytest.approx(0.0, abs=1e-4) and run.state(run.t[-1])[1] == pytest.approx(
-        -0.25, abs=1e-4
-    )
-    assert run.state(1.0)[1] == pytest.approx(
-        convolved(lambda s: run.state(np.clip(s, *run.t[[0, -1]]))[0], 2.0, 1.0), abs=1e-6
-    )
+    assert run.state(run.t[0])[1] == pytest.approx(0.0, abs=1e-4) and run.state(run.t[-1])[1] == pytest.approx(-0.25, abs=1e-4)
+    assert run.state(1.0)[1] == pytest.approx(convolved(lambda s: run.state(np.clip(s, *run.t[[0, -1]]))[0], 2.0, 1.0), abs=1e-6)
     assert "hyperbolic" in sv.report(run).verdict
 
 

@@ -128,13 +128,7 @@ def test_a_choice_beyond_the_bound_is_warned_about_with_its_number(sine):
 
 def test_a_choice_beyond_the_bound_is_warned_about_backwards_in_time(sine):
     with warned(" 60 1/s", "= 3 ", "2.785"):
-        sv.simulate(
-            sine,
-            sine.start(),
-            (0.0, -1.0),
-            sv.methods.RungeKutta(4, step=0.05),
-            drift=sv.methods.Poles({"X": [60.0, 60.0]}),
-        )
+        sv.simulate(sine, sine.start(), (0.0, -1.0), sv.methods.RungeKutta(4, step=0.05), drift=sv.methods.Poles({"X": [60.0, 60.0]}))
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

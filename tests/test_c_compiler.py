@@ -65,15 +65,10 @@ def test_a_long_grid_is_compiled(fresh):
     assert len(fresh) == 1 and model.backend == "c"
 
 
-@pytest.mark.parametrize(
-    "use",
-    [
-        lambda m: m.grid(0.0, np.zeros((2, 1)), [1.0]),
-        lambda m: m.buffer(),
-        lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4),
-        lambda m: m.newton(np.zeros(1), np.zeros((1, 9)), [1.0]),
-    ],
-)
+@pytest.mark.parametrize("use", [lambda m: m.grid(0.0, np.zeros((2, 1)), [1.0]),
+                                 lambda m: m.buffer(),
+                                 lambda m: m.rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4),
+                                 lambda m: m.newton(np.zeros(1), np.zeros((1, 9)), [1.0])])
 def test_what_an_integration_uses_is_compiled_at_its_first_use(fresh, use):
     model = pendulum_with_loops()
     use(model)
@@ -159,18 +154,11 @@ def test_a_long_series_is_left_to_casadi(fresh, monkeypatch):
     np.testing.assert_allclose(*runs, rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda data: b"",
-        lambda data: b"not a library",
-        lambda data: data[:-1000],
-        lambda data: data[:3000] + b"?" + data[3001:],
-    ],
-)
+@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: b"not a library", lambda data: data[:-1000],
+                                    lambda data: data[:3000] + b"?" + data[3001:]])
 def test_a_damaged_library_is_built_again(fresh, monkeypatch, damage):
     pendulum(("rk",)).rk(0.0, [0.0, 0.0], 0.1, 1, [1.0], RK4)
-    (kept,) = compiler.cache_directory().iterdir()
+    kept, = compiler.cache_directory().iterdir()
     whole = kept.read_bytes()
     kept.unlink()
     kept.write_bytes(damage(whole))
@@ -272,11 +260,8 @@ def test_a_named_compiler_that_does_not_exist_is_warned_about(fresh, monkeypatch
 
 def test_a_cache_without_room_is_replaced_by_a_temporary_directory(fresh, tmp_path, monkeypatch):
     script = tmp_path / "full-cc"
-    script.write_text(
-        f'#!/bin/sh\ncase "$*" in *{tmp_path}/cache*) echo "No space left on device" >&2; exit 1;; esac\n'
-        'exec cc "$@"\n',
-        encoding="utf-8",
-    )
+    script.write_text(f'#!/bin/sh\ncase "$*" in *{tmp_path}/cache*) echo "No space left on device" >&2; exit 1;; esac\n'
+                      'exec cc "$@"\n', encoding="utf-8")
     script.chmod(0o755)
     monkeypatch.setenv("CC", str(script))
     model = pendulum(("rk",))

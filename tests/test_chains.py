@@ -51,9 +51,7 @@ def compiled(f, chained=True):
 
 def chain(statements):
     """Operations in the longest chain from the entries of x whose rates are computed to an output."""
-    late = {
-        "x" + target[1:] for target, _, operands in statements if isinstance(target, str) and type(operands[0]) is int
-    }
+    late = {"x" + target[1:] for target, _, operands in statements if isinstance(target, str) and type(operands[0]) is int}
     length = dict.fromkeys(late, 0)
     for target, _, operands in statements:
         before = [length[v] for v in operands if v in length]
@@ -153,9 +151,7 @@ def test_like_terms_of_an_elimination_are_collected(scene):
     assert len(statements(f, chained=False)) >= before and len(statements(f)) <= after
 
 
-@pytest.mark.parametrize(
-    "scene, number", [("overhead_crane", 2), ("double_pendulum", 2), ("crane_3d", 2), ("furuta_pendulum", 2)]
-)
+@pytest.mark.parametrize("scene, number", [("overhead_crane", 2), ("double_pendulum", 2), ("crane_3d", 2), ("furuta_pendulum", 2)])
 def test_the_fastest_way_is_taken(scene, number):
     """As measured, of the ways by number: 57, 48, 46, 46; 81, 74, 69, 76; 110, 103, 103, 109; 90, 82, 49, 49 ns a step."""
     f = sv.plant(getattr(gallery, scene)()[0]).function("ode").expression
@@ -247,9 +243,7 @@ def test_collected_rates_are_as_accurate_in_all_units(scene):
 
 @extended
 @np.errstate(all="ignore")
-@pytest.mark.parametrize(
-    "scene", ("overhead-crane", "crane-3d", "vtol", "slung-load", "rotary-crane", "three-cars", "beam-crane")
-)
+@pytest.mark.parametrize("scene", ("overhead-crane", "crane-3d", "vtol", "slung-load", "rotary-crane", "three-cars", "beam-crane"))
 def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):
     """Against extended precision, at states near the path and on its knots, where conditions decide alike."""
     model = gallery_model(scene)
@@ -286,18 +280,13 @@ def test_conditions_are_evaluated_once():
         assert (operations.count(ca.OP_DIV), operations.count(ca.OP_IF_ELSE_ZERO)) == (1, 6)
         for t in (-1.0, 0.0, 1.3, 3.0, np.nextafter(3.0, 4.0), 5.0):
             x = np.array([0.3, -2.0, 0.0, 0.0])
-            np.testing.assert_allclose(
-                evaluated(some, t, x, np.ones(3)), np.array(f(t, x, 1)).ravel(), rtol=1e-14, atol=0
-            )
+            np.testing.assert_allclose(evaluated(some, t, x, np.ones(3)), np.array(f(t, x, 1)).ravel(), rtol=1e-14, atol=0)
 
 
 def test_small_differences_keep_their_digits():
     """What is multiplied out has no differences of larger terms than before."""
-    f = function(
-        (X[0] - X[1]) * (X[0] + X[1]) * A + (X[0] - X[1]) ** 2 * B,
-        (X[0] - X[1]) * A + (X[1] - X[0]) * B,
-        1e6 * (X[1] - 1) + A * X[2] + B * X[3],
-    )
+    f = function((X[0] - X[1]) * (X[0] + X[1]) * A + (X[0] - X[1]) ** 2 * B, (X[0] - X[1]) * A + (X[1] - X[0]) * B,
+                 1e6 * (X[1] - 1) + A * X[2] + B * X[3])
     x, p = np.array([1.0, 1.0 + 1e-12, 0, 0]), [1.0, 3.0, 1.0]
     values = [np.array(ca.Function("way", f.sx_in(), [way])(0, x, p)).ravel() for way in emit.other_ways(f)]
     d = x[0] - x[1]

@@ -33,9 +33,7 @@ def test_the_least_whole_number_is_a_bound():
     assert error_of(checks.whole, "n", 0, least=1).details["value"] == 0
 
 
-@pytest.mark.parametrize(
-    ("given", "limits"), [(2, (-2.0, 2.0)), ((1, None), (1.0, np.inf)), ((None, 3), (-np.inf, 3.0))]
-)
+@pytest.mark.parametrize(("given", "limits"), [(2, (-2.0, 2.0)), ((1, None), (1.0, np.inf)), ((None, 3), (-np.inf, 3.0))])
 def test_intervals(given, limits):
     assert checks.interval("force", given, "limit") == limits
 

@@ -88,7 +88,9 @@ def test_what_makes_no_sense_cannot_be_made(make, details):
     assert caught.value.details == details
 
 
-@pytest.mark.parametrize("make", [lambda: sv.methods.Adaptive("RK4"), lambda: as_method(["Taylor"])])
+@pytest.mark.parametrize(
+    "make", [lambda: sv.methods.Adaptive("RK4"), lambda: as_method(["Taylor"])]
+)
 def test_names_belong_to_families(make):
     with pytest.raises(sv.errors.NameUnknown):
         make()

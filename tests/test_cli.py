@@ -76,11 +76,7 @@ def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     printed = capsys.readouterr().out
     assert printed.splitlines()[-1] == f"open {folder.relative_to(here) / 'index.html'}"
     report = (folder / "report.txt").read_text(encoding="utf-8")
-    assert all(
-        word in text
-        for text in (printed, report)
-        for word in ("Model: x, l, theta", "State at t = 0 s", "Run: ", "Verification: passed")
-    )
+    assert all(word in text for text in (printed, report) for word in ("Model: x, l, theta", "State at t = 0 s", "Run: ", "Verification: passed"))
     run = servoctl.load(folder / "run.npz")
     assert run.success and run.t[-1] == 8.0
 
@@ -108,15 +104,7 @@ def test_run_leaves_numbers_figures_and_the_report(here, capsys):
     assert re.findall('alt="([^"]+)" src="data:image/png;base64,', page) == pictures  # all inside, nothing elsewhere
     assert page.count("src=") == len(pictures) and not re.search("href|https?://|url\\(", page)
     assert len(page) < LARGEST_PAGE
-    for value in (
-        "-137.992",
-        "1041.23",
-        "servoctl run overhead-crane",
-        '<figure class="motion">',
-        "Verification: passed",
-        "within",
-        "lqr",
-    ):
+    for value in ("-137.992", "1041.23", "servoctl run overhead-crane", '<figure class="motion">', "Verification: passed", "within", "lqr"):
         assert value in page
     assert re.search(r"<td>hoist</td>(<td class=n>[^<]+</td>){4}<td>N</td>", page)
     assert "<td>index</td><td>5</td>" in page
@@ -186,8 +174,7 @@ def test_a_program_that_cannot_be_realised_is_reported(here, capsys):
         "    q = sv.coordinates('x y')\n"
         "    x, y = q\n"
         "    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={'F': x})\n"
-        "    return mechanism, sv.Program({'x': x - q.t, 'y': y})\n",
-        encoding="utf-8",
+        "    return mechanism, sv.Program({'x': x - q.t, 'y': y})\n", encoding="utf-8"
     )
     assert main(["report", "free.py"]) == 0
     assert "Report: not realisable" in capsys.readouterr().out
@@ -214,9 +201,7 @@ def test_the_page_shows_the_motion(here, fall):
     assert page.index('<figure class="motion">') < page.index('alt="motion.png"') and "motion.gif" not in page
     assert "not verified" in page and "on a machine with m = 2.5" in page and len(page) < LARGEST_PAGE
     assert main(["run", fall, "--t-span", "0", "0.2", "--no-verify", "--no-figures"]) == 0
-    assert not (folder / "motion.gif").exists() and not re.search(
-        "<img|<svg", (folder / "index.html").read_text(encoding="utf-8")
-    )
+    assert not (folder / "motion.gif").exists() and not re.search("<img|<svg", (folder / "index.html").read_text(encoding="utf-8"))
 
 
 def test_each_figure_has_a_file_of_its_own_where_that_is_wanted(here, fall):
@@ -230,9 +215,7 @@ def test_each_figure_has_a_file_of_its_own_where_that_is_wanted(here, fall):
 
 def test_a_mechanism_that_cannot_be_drawn_has_a_page_without_it(here, capsys):
     text = FALL.replace("x y", "a b").replace('"y"', '"b"')
-    (here / "turn.py").write_text(
-        text.replace('"dy"', '"db"').replace('"x": "m", "b": "m"', '"a": "rad"'), encoding="utf-8"
-    )
+    (here / "turn.py").write_text(text.replace('"dy"', '"db"').replace('"x": "m", "b": "m"', '"a": "rad"'), encoding="utf-8")
     assert main(["run", "turn.py", "--animate", "--no-verify", "--no-loop"]) == 0
     assert "There is no animation" in capsys.readouterr().err
     names = {f.name for f in (here / "servoctl-runs" / "turn").iterdir()}
@@ -245,13 +228,7 @@ def test_a_mechanism_that_cannot_be_drawn_has_a_page_without_it(here, capsys):
 def test_run_of_a_users_file(here, fall, capsys):
     assert main(["run", fall, "--set", "m=3", "--hold", "dy=1.5", "--no-figures"]) == 0
     folder = here / "servoctl-runs" / "fall"
-    assert {f.name for f in folder.iterdir()} == {
-        "index.html",
-        "run.npz",
-        "closed_loop.npz",
-        "summary.json",
-        "report.txt",
-    }
+    assert {f.name for f in folder.iterdir()} == {"index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt"}
     facts = summary(folder)
     assert facts["scene"]["description"] == "A mass in a plane follows a path in x, and falls."
     assert facts["parameters"] == {"m": 3.0, "g": 9.81}
@@ -279,9 +256,7 @@ def test_a_guess_frees_what_the_scene_holds(here, fall):
 def test_a_file_may_import_its_neighbours(here, fall, capsys):
     (here / "sub").mkdir()
     (here / "sub" / "masses_of_fall.py").write_text("m = 4.0\n", encoding="utf-8")
-    (here / "sub" / "other.py").write_text(
-        "import masses_of_fall\n" + FALL.replace("m=2.0", "m=masses_of_fall.m"), encoding="utf-8"
-    )
+    (here / "sub" / "other.py").write_text("import masses_of_fall\n" + FALL.replace("m=2.0", "m=masses_of_fall.m"), encoding="utf-8")
     assert main(["report", "sub/other.py"]) == 0
     assert "m=4" in capsys.readouterr().out
 
@@ -397,13 +372,7 @@ def test_a_folder_that_is_lost_while_computing_loses_nothing(here, fall, capsys,
     monkeypatch.setattr(servoctl, when, losing)
     assert main(["run", fall, "--out", "lost", "--no-figures"]) == 1
     (kept,) = (here / "temporary").iterdir()
-    assert {f.name for f in kept.iterdir()} == {
-        "index.html",
-        "run.npz",
-        "closed_loop.npz",
-        "summary.json",
-        "report.txt",
-    }
+    assert {f.name for f in kept.iterdir()} == {"index.html", "run.npz", "closed_loop.npz", "summary.json", "report.txt"}
     assert f"it is written to {kept} instead" in words(capsys.readouterr().err)
     assert servoctl.load(kept / "run.npz").success
 

@@ -473,12 +473,7 @@ def test_laws_refuse_plans_and_plants_that_do_not_fit(point_plan, crane_plan, tm
     with refused(sv.errors.SpecificationError, "2 s", "10 s"):
         sv.feedforward(point_plan, sv.plant(POINT), rate=0.1)
     law = sv.pd(point_plan, sv.plant(POINT), kp={"force": 100.0}, kd={"force": 20.0})
-    for wrong in (
-        {"schedule": law.schedule[:2]},
-        {"state": np.zeros(1)},
-        {"measures": ()},
-        {"initial_input": np.zeros(2)},
-    ):
+    for wrong in ({"schedule": law.schedule[:2]}, {"state": np.zeros(1)}, {"measures": ()}, {"initial_input": np.zeros(2)}):
         with refused(sv.errors.SpecificationError, law.name):
             replace(law, **wrong)
     rough = sv.plant(POINT, forces={"x": -ca.sqrt(ca.fabs(POINT.q.d(1)[0]))})

@@ -26,9 +26,7 @@ from servoctl.jets.branches import contains
 from servoctl.methods.runge_kutta import tableau
 from servoctl.values import same
 
-of_numpy_2 = pytest.mark.skipif(
-    not hasattr(np, "_core"), reason="NumPy 1 has another interface: points stay with CasADi"
-)
+of_numpy_2 = pytest.mark.skipif(not hasattr(np, "_core"), reason="NumPy 1 has another interface: points stay with CasADi")
 
 T, X2, P1 = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("p", 1)
 RK4 = tableau("RK4")
@@ -59,55 +57,20 @@ def random_function(n):
     values = [T, *ca.vertsplit(X2), P1]
     while len(values) < n:
         a, b = (values[max(0, len(values) - 1 - int(rng.exponential(life)))] for life in (40, 300))
-        values.append(
-            [
-                a + 0.3 * b,
-                a * b / (1 + a * a),
-                ca.sin(a) - b,
-                ca.cos(b) * a,
-                ca.sqrt(1 + a * a) - b / 3,
-                ca.tanh(a - b),
-            ][rng.integers(6)]
-        )
+        values.append([a + 0.3 * b, a * b / (1 + a * a), ca.sin(a) - b, ca.cos(b) * a, ca.sqrt(1 + a * a) - b / 3,
+                       ca.tanh(a - b)][rng.integers(6)])
     return function(*values[-20:], *values[4::400])
 
 
 # --- the emitted operations
 
 
-UNARY = (
-    "neg sq twice inv sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh fabs "
-    "floor ceil sign not erf erfinv"
-).split()
+UNARY = ("neg sq twice inv sqrt exp log expm1 log1p sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh fabs "
+         "floor ceil sign not erf erfinv").split()
 BINARY = ("add sub mul div pow fmin fmax fmod remainder atan2 copysign hypot lt le eq ne and or if_else_zero").split()
 CONSTANTS = (np.inf, -np.inf, np.nan, -3.25, 0.1, 1 / 3, 5e-324, -1.7976931348623157e308, 6.02214076e23)
-EDGES = (
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    0.5,
-    -0.5,
-    0.7,
-    -0.7,
-    2.0,
-    -2.0,
-    3.0,
-    np.inf,
-    -np.inf,
-    np.nan,
-    1e-308,
-    5e-324,
-    1e308,
-    -1e308,
-    1e-8,
-    1 - 2**-53,
-    2**-53 - 1,
-    1 + 2**-52,
-    1e5,
-    700.0,
-    -750.0,
-)
+EDGES = (0.0, -0.0, 1.0, -1.0, 0.5, -0.5, 0.7, -0.7, 2.0, -2.0, 3.0, np.inf, -np.inf, np.nan, 1e-308, 5e-324, 1e308,
+         -1e308, 1e-8, 1 - 2**-53, 2**-53 - 1, 1 + 2**-52, 1e5, 700.0, -750.0)
 
 
 def in_buffer(model, t, x, p):
@@ -121,25 +84,13 @@ def in_buffer(model, t, x, p):
 def every_operation():
     """A function of all operations, their expressions, and states (2, n) at and between their edges."""
     a, b = X2[0], X2[1]
-    expressions = [
-        *(ca.SX.unary(getattr(ca, f"OP_{name.upper()}"), a) for name in UNARY),
-        *(ca.SX.binary(getattr(ca, f"OP_{name.upper()}"), a, b) for name in BINARY),
-        *(ca.SX.binary(ca.OP_CONSTPOW, a, c) for c in (2.5, -1.5, 0.5, 3, -2, 1 / 3)),
-        *(a + c for c in CONSTANTS),
-        *CONSTANTS,
-        T,
-        a,
-        P1,
-    ]
+    expressions = [*(ca.SX.unary(getattr(ca, f"OP_{name.upper()}"), a) for name in UNARY),
+                   *(ca.SX.binary(getattr(ca, f"OP_{name.upper()}"), a, b) for name in BINARY),
+                   *(ca.SX.binary(ca.OP_CONSTPOW, a, c) for c in (2.5, -1.5, 0.5, 3, -2, 1 / 3)),
+                   *(a + c for c in CONSTANTS), *CONSTANTS, T, a, P1]
     rng = np.random.default_rng(0)
-    x = np.hstack(
-        [
-            np.array(list(itertools.product(EDGES, EDGES))).T,
-            rng.normal(size=(2, 1000)),
-            1e3 * rng.normal(size=(2, 500)),
-            rng.uniform(-1, 1, (2, 500)),
-        ]
-    )
+    x = np.hstack([np.array(list(itertools.product(EDGES, EDGES))).T, rng.normal(size=(2, 1000)),
+                   1e3 * rng.normal(size=(2, 500)), rng.uniform(-1, 1, (2, 500))])
     return expressions, x
 
 
@@ -247,9 +198,7 @@ def test_chunks_equal_one_function_and_casadi_to_the_last_bit(monkeypatch, c_com
 def test_phases_equal_one_function_to_the_last_bit_after_other_corrections(monkeypatch, c_compiler, chunk):
     monkeypatch.setenv("CC", "cc -ffp-contract=off")
     f = random_function(2600)
-    text = (
-        emit.emit(f, "f", ("newton",), chunk=chunk)
-        + """
+    text = emit.emit(f, "f", ("newton",), chunk=chunk) + """
 void f_again(double t, const double *x, const double *other, const double *p, double *y)
 {
     double w[WORK];
@@ -259,12 +208,7 @@ void f_again(double t, const double *x, const double *other, const double *p, do
     f_rest(t, x, p, y, w);
 }
 """
-    )
-    library, x, other, p, y = (
-        compiler.library(text),
-        *map(np.array, ([0.5, -0.7], [3.0, 1e200], [1.1])),
-        np.zeros(f.numel_out()),
-    )
+    library, x, other, p, y = compiler.library(text), *map(np.array, ([0.5, -0.7], [3.0, 1e200], [1.1])), np.zeros(f.numel_out())
     library.f_again(ctypes.c_double(0.3), *(ctypes.c_void_p(a.ctypes.data) for a in (x, other, p, y)))
     np.testing.assert_array_equal(y, np.asarray(f(0.3, x, p)).ravel())
     np.testing.assert_array_equal(in_buffer(compiled(f, "f", ("rk",)), 0.3, x, p), y)
@@ -356,14 +300,9 @@ def test_points_of_a_function_called_often_are_compiled_with_the_bits_of_casadi(
 @of_numpy_2
 def test_compiled_points_take_what_others_take(monkeypatch, c_compiler):
     model, many = pendulum(), np.array([[0.3, 9.0, 1.2], [8.0, 7.0, 6.0]])
-    forms = [
-        (2.0, many[0, ::2], [1.5]),
-        (2, [0.3, 1.2], (1.5,)),
-        (np.float64(2), np.float64([0.3, 1.2]), np.ones(1) * 1.5),
-        (np.array(2.0), many[:1, ::2].ravel(), np.array(["1.5"])),
-        (True + 1, (0.3, 1.2), np.array([1.5], ">f8")),
-        (2.0, np.array([0.3, 1.2]), np.frombuffer(b"-" + np.float64(1.5).tobytes(), offset=1)),
-    ]  # not aligned
+    forms = [(2.0, many[0, ::2], [1.5]), (2, [0.3, 1.2], (1.5,)), (np.float64(2), np.float64([0.3, 1.2]), np.ones(1) * 1.5),
+             (np.array(2.0), many[:1, ::2].ravel(), np.array(["1.5"])), (True + 1, (0.3, 1.2), np.array([1.5], ">f8")),
+             (2.0, np.array([0.3, 1.2]), np.frombuffer(b"-" + np.float64(1.5).tobytes(), offset=1))]  # not aligned
     before = [model(*form) for form in forms]
     often(monkeypatch, model)
     assert model._builtin
@@ -394,22 +333,9 @@ def test_arrays_of_every_kind_reach_compiled_points(monkeypatch, c_compiler):
     y, grid = model(2.0, x, p), np.array([[0.3, 1.2], [7.0, 8.0]])
     swapped, read_only = x.astype(">f8"), x.copy()
     read_only.flags.writeable = False
-    forms = (
-        x.view(Own),
-        read_only,
-        pickle.loads(pickle.dumps(x)),
-        swapped,
-        x.astype(np.dtype("f8").newbyteorder("=")),
-        x[::-1].copy()[::-1],
-        np.asfortranarray(grid)[0],
-        grid[0],
-        np.broadcast_to(x, (1, 2))[0],
-        x.astype(np.longdouble),
-        x.astype(np.dtype("f8", metadata={"unit": "m"})),
-        x.astype(object),
-        memoryview(x),
-        x.view("V8").view(float),
-    )
+    forms = (x.view(Own), read_only, pickle.loads(pickle.dumps(x)), swapped, x.astype(np.dtype("f8").newbyteorder("=")),
+            x[::-1].copy()[::-1], np.asfortranarray(grid)[0], grid[0], np.broadcast_to(x, (1, 2))[0], x.astype(np.longdouble),
+            x.astype(np.dtype("f8", metadata={"unit": "m"})), x.astype(object), memoryview(x), x.view("V8").view(float))
     for form in forms:
         assert type(result := model(2.0, form, p)) is np.ndarray
         np.testing.assert_array_equal(result, y)
@@ -510,21 +436,13 @@ def test_threads_do_not_share_memory(backend):
     assert not wrong
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda m: m(0.0, [1.0], [1.0]),
-        lambda m: m(0.0, [[1.0], [2.0]], [1.0]),
-        lambda m: m(0.0, [1.0, 2.0], []),
-        lambda m: m.grid([0.0, 1.0], np.zeros((2, 3)), [1.0]),
-        lambda m: m.grid(0.0, np.zeros((3, 2)), [1.0]),
-        lambda m: m.grid(0.0, np.zeros((2, 3)), np.zeros((1, 2))),
-        lambda m: m.rk(0.0, [1.0], 0.1, 5, [1.0], RK4),
-        lambda m: m.rk(0.0, [1.0, 0.0], 0.1, -1, [1.0], RK4),
-        lambda m: m.rk(0.0, [1.0, 0.0], 0.1, 5, [1.0], RK4, every=0),
-        lambda m: m.continuation([0.0], [1.0, 0.0], [1.0], 1.0, 1),
-    ],
-)
+@pytest.mark.parametrize("call", [
+    lambda m: m(0.0, [1.0], [1.0]), lambda m: m(0.0, [[1.0], [2.0]], [1.0]), lambda m: m(0.0, [1.0, 2.0], []),
+    lambda m: m.grid([0.0, 1.0], np.zeros((2, 3)), [1.0]), lambda m: m.grid(0.0, np.zeros((3, 2)), [1.0]),
+    lambda m: m.grid(0.0, np.zeros((2, 3)), np.zeros((1, 2))), lambda m: m.rk(0.0, [1.0], 0.1, 5, [1.0], RK4),
+    lambda m: m.rk(0.0, [1.0, 0.0], 0.1, -1, [1.0], RK4), lambda m: m.rk(0.0, [1.0, 0.0], 0.1, 5, [1.0], RK4, every=0),
+    lambda m: m.continuation([0.0], [1.0, 0.0], [1.0], 1.0, 1),
+])
 def test_wrong_arguments_are_refused(call):
     with pytest.raises(SpecificationError):
         call(pendulum(("rk",)))
@@ -536,7 +454,6 @@ def test_wrong_arguments_are_refused(call):
 def numpy_rk4(t, x, h, n, p):
     def rate(t, x):
         return np.array([x[1], -p * np.sin(x[0]) + np.cos(t)])
-
     states = [x]
     for k in range(n):
         tk = t + k * h
@@ -559,9 +476,8 @@ def test_rk_equals_a_numpy_loop(backend):
     np.testing.assert_allclose(guards, [x[0] ** 2 + t], rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("n", "every", "logged"), [(10, 3, [0, 3, 6, 9, 10]), (9, 3, [0, 3, 6, 9]), (2, 5, [0, 2]), (0, 1, [0])]
-)
+@pytest.mark.parametrize(("n", "every", "logged"), [(10, 3, [0, 3, 6, 9, 10]), (9, 3, [0, 3, 6, 9]), (2, 5, [0, 2]),
+                                                    (0, 1, [0])])
 def test_rk_logs_the_start_every_few_steps_and_the_end(backend, n, every, logged):
     model = pendulum(("rk",))
     t, x, guards = model.rk(1.0, [0.3, 0.0], 0.1, n, [2.0], RK4, every=every)
@@ -641,7 +557,7 @@ def test_newton_on_three_equations(backend):
 
 def test_newton_halves_a_step_that_is_too_long(backend):
     x = ca.SX.sym("x")
-    model = newton_model(ca.atan(x - 50 * ca.sin(T)), x, "narrow")  # Newton converges within 1.39 of the root only
+    model = newton_model(ca.atan(x - 50 * ca.sin(T)), x, "narrow")       # Newton converges within 1.39 of the root only
     t = np.arange(0.0, 6.0, 0.5)
     solution, _, iterations = along(model, t, [0.1], [0.0])
     np.testing.assert_allclose(solution[0], 50 * np.sin(t), rtol=0, atol=1e-13)

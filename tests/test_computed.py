@@ -135,9 +135,7 @@ def test_unstable_internal_dynamics_are_refused_with_a_pointer():
     model = sv.derive(*vtol("centre"))
     with warned("unstable over these 0.5 s"):
         plan = sv.simulate(model, model.start(theta=0.0, dtheta=0.0), (0.0, 0.5))
-    with refused(
-        sv.errors.UnstableInternalDynamics, "lqr", states=("theta", "dtheta"), eigenvalue=pytest.approx(15.09, abs=0.01)
-    ):
+    with refused(sv.errors.UnstableInternalDynamics, "lqr", states=("theta", "dtheta"), eigenvalue=pytest.approx(15.09, abs=0.01)):
         sv.computed(plan, sv.plant(model.reduction.mechanism))
 
 

@@ -168,8 +168,7 @@ def test_projection_leaves_no_residual(method, rod):
 
 def test_projection_of_every_tenth_step_is_enough(rod):
     often, seldom = (
-        sv.simulate(*rod, (0.0, 20.0), method=sv.methods.RungeKutta(4, step=2e-3), drift=sv.methods.Project(every))
-        for every in (1, 10)
+        sv.simulate(*rod, (0.0, 20.0), method=sv.methods.RungeKutta(4, step=2e-3), drift=sv.methods.Project(every)) for every in (1, 10)
     )
     assert seldom.counters["projections"] == pytest.approx(often.counters["projections"] / 10, abs=2)
     assert max(by_quarters(seldom)) < 1e-9

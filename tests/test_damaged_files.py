@@ -153,19 +153,8 @@ class OddFacts(Exception):
     details = {(1, 2): object()}
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        Speechless(),
-        Endless("x"),
-        OddFacts("x"),
-        GeneratorExit(),
-        SystemExit(3),
-        ValueError("\ud800"),
-        BaseException("base"),
-    ],
-    ids=lambda error: type(error).__name__,
-)
+@pytest.mark.parametrize("error", [Speechless(), Endless("x"), OddFacts("x"), GeneratorExit(), SystemExit(3),
+                                   ValueError("\ud800"), BaseException("base")], ids=lambda error: type(error).__name__)
 def test_no_error_of_a_case_ends_a_sweep(error, tmp_path):
     def case(m):
         if m == 2.0:
@@ -179,11 +168,8 @@ def test_no_error_of_a_case_ends_a_sweep(error, tmp_path):
     study.csv(tmp_path / "study.csv")
 
 
-@pytest.mark.parametrize(
-    "value, error",
-    [(10**400, True), (-(10**5000), True), (2**70, False), (2**63, False)],
-    ids=["400 digits", "5000 digits", "2^70", "2^63"],
-)
+@pytest.mark.parametrize("value, error", [(10**400, True), (-(10**5000), True), (2**70, False), (2**63, False)],
+                         ids=["400 digits", "5000 digits", "2^70", "2^63"])
 def test_whole_numbers_of_any_size_are_saved_without_pickle(value, error, tmp_path):
     study = sv.sweep(lambda m: {"r": value if m == 2.0 else m}, CASES)
     again = sv.load(study.save(tmp_path / "study"))

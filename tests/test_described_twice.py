@@ -290,9 +290,7 @@ def test_files_that_say_a_thing_twice_or_of_nothing_are_refused(case):
         sv.urdf(ARM.replace(old, new))
 
 
-@pytest.mark.parametrize(
-    "armature, kind", [({"ja": -0.1}, sv.errors.SpecificationError), ({"jb": 1.0}, sv.errors.NameUnknown)]
-)
+@pytest.mark.parametrize("armature, kind", [({"ja": -0.1}, sv.errors.SpecificationError), ({"jb": 1.0}, sv.errors.NameUnknown)])
 def test_a_negative_rotor_and_one_of_no_joint_are_refused(armature, kind):
     with refused(kind, *armature):
         sv.urdf(ARM).mechanism(armature=armature)

@@ -189,9 +189,7 @@ def test_derivatives_equal_differences(name, signals, names, request):
     """Of mean squares and of signals at nodes that move with the duration: flat, bounded, forward, quasi-velocities."""
     make = {"aircraft": aircraft, "hanging": hanging, "wheel": wheel_on_a_line}
     model, p = make[name]() if name in make else request.getfixturevalue(name)
-    motions = Motions(
-        model, names, _span(model, (0.0, p.T), dict.fromkeys(names)), ({}, {"l": 4.0} if name == "crane" else None)
-    )
+    motions = Motions(model, names, _span(model, (0.0, p.T), dict.fromkeys(names)), ({}, {"l": 4.0} if name == "crane" else None))
     ranges = motions.numbers[:, None] * [[0.8, 1.2]]
     search, h = Search(motions, ranges, "peak", signals, {}), 1e-3
     at = search.at(middle := np.full(len(names), 0.5))
@@ -216,9 +214,7 @@ def test_the_crane_is_as_good_as_a_grid_of_its_closed_form(crane):
         found = sv.design(model, vary, (0.0, 6.0), minimise, of="trolley", guess={"l": 4.0})
         best, centre, width = np.inf, np.array([2.5, 2.75]), np.array([2.0, 0.75])
         for _ in range(8):  # each grid finer, about the best point of the one before
-            axes = [
-                np.clip(c + w * np.linspace(-1, 1, 7), *vary[n]) for c, w, n in zip(centre, width, vary, strict=True)
-            ]
+            axes = [np.clip(c + w * np.linspace(-1, 1, 7), *vary[n]) for c, w, n in zip(centre, width, vary, strict=True)]
             grid = [(cost(crane_forces(x, z)["trolley"]), x, z) for x in axes[0] for z in axes[1]]
             best, *centre = min(grid)
             centre, width = np.array(centre), width / 2
@@ -389,9 +385,7 @@ def test_units_and_the_begin_of_the_span_do_not_matter():
     """Millimetres and milliseconds; from 1 to 1 + T, with dwells before and after it; by symmetry through 0.5."""
     u, s = 1e3, 1e-3
     model, p = mass(
-        lambda t, p: sv.paths.spline((t - s) / p.T, [0.0, 0.5, 1.0], [0.0, p.via, u], smoothness=3),
-        T=3.0 * s,
-        via=0.6 * u,
+        lambda t, p: sv.paths.spline((t - s) / p.T, [0.0, 0.5, 1.0], [0.0, p.via, u], smoothness=3), T=3.0 * s, via=0.6 * u
     )
     ranges, span = {"T": (s, 20.0 * s), "via": (0.0, u)}, (0.5 * s, 1.5 * s + p.T)
     found = sv.design(model, ranges, span, "time", limits={"push": 4.0 * u / s**2})

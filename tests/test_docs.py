@@ -42,16 +42,8 @@ def test_every_block_is_executed_or_printed_by_a_test():
 
 
 def test_a_notebook_is_a_page_with_its_outputs(tmp_path):
-    picture, code = (
-        {"image/png": "AAEC\n", "text/plain": ["<Figure>"]},
-        {"cell_type": "code", "source": ["a = 1\n", "a"]},
-    )
-    printed = [
-        {"output_type": "stream", "text": ["one\n", "two\n"]},
-        {"data": picture},
-        {"data": picture},
-        {"text": []},
-    ]
+    picture, code = {"image/png": "AAEC\n", "text/plain": ["<Figure>"]}, {"cell_type": "code", "source": ["a = 1\n", "a"]}
+    printed = [{"output_type": "stream", "text": ["one\n", "two\n"]}, {"data": picture}, {"data": picture}, {"text": []}]
     cells = [{"cell_type": "markdown", "source": ["# Title"]}, {**code, "outputs": printed}]
     (tmp_path / "name.ipynb").write_text(json.dumps({"cells": cells}), encoding="utf-8")
     page = runpy.run_path(str(DOCS / "conf.py"))["as_page"](tmp_path / "name.ipynb", tmp_path)

@@ -43,9 +43,7 @@ def test_a_ball_lands(ball, method):
 def test_two_roots_in_one_step_are_found(ball, method):
     """The ball is above a line just below its highest point for 2 sqrt(2 d / g)."""
     below = 1e-3
-    run = sv.simulate(
-        ball, THROWN, (0.0, 2.0), method, events=sv.Event("y", UP**2 / (2 * g) - below), t_eval=[0.0, 2.0]
-    )
+    run = sv.simulate(ball, THROWN, (0.0, 2.0), method, events=sv.Event("y", UP**2 / (2 * g) - below), t_eval=[0.0, 2.0])
     (t,) = run.t_events.values()
     assert t == pytest.approx(UP / g + np.sqrt(2 * below / g) * np.array([-1.0, 1.0]), abs=1e-6)
 

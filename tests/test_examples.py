@@ -164,9 +164,7 @@ def test_closed_loop_crane_with_noise_and_delay(numbers):
         quiet, noisy = (result[f"{before}{name}: worst [mm]"] for before in ("", "noise, "))
         assert noisy == pytest.approx(quiet, rel=0.03)
         assert result[f"noise, {name}: {END}"] <= result[f"{name}: {END}"] + 1.0
-    assert (
-        result["noise, limited: trolley [N]"] <= 150.0 and result["noise, limited: worst [mm]"] < 90.0
-    )  # 52 .. 86 by seed
+    assert result["noise, limited: trolley [N]"] <= 150.0 and result["noise, limited: worst [mm]"] < 90.0  # 52 .. 86 by seed
     assert result["noise, computed, 0.06 s: trolley [N]"] > 100 * result["feedforward: trolley [N]"]
     assert result["noise, LQR with integral: trolley [N]"] < 400.0
 
@@ -220,11 +218,7 @@ def test_the_table_of_other_machines_is_what_the_example_says(numbers):
 
 
 def test_the_page_of_examples_has_all_of_them_and_their_numbers(numbers):
-    rows = re.findall(
-        r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$",
-        (EXAMPLES.parent / "docs" / "examples.md").read_text(encoding="utf-8"),
-        re.M,
-    )
+    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", (EXAMPLES.parent / "docs" / "examples.md").read_text(encoding="utf-8"), re.M)
     assert sorted(name for name, _ in rows) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
     shown = [(name, *number) for name, cell in rows for number in re.findall(r"`([^`]+)` (-?[\d.]*\d)", cell)]
     assert len(shown) > 20

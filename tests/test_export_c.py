@@ -40,12 +40,8 @@ class Exported:
 
     def __call__(self, function, *arguments):
         call = [
-            a.ctypes.data_as(ctypes.c_void_p)
-            if isinstance(a, np.ndarray)
-            else a
-            if isinstance(a, ctypes.c_float)
-            else ctypes.c_double(a)
-            for a in arguments
+            a.ctypes.data_as(ctypes.c_void_p) if isinstance(a, np.ndarray)
+            else a if isinstance(a, ctypes.c_float) else ctypes.c_double(a) for a in arguments
         ]
         return self.library[f"{self.name}_{function}"](*call)
 
@@ -169,9 +165,7 @@ def test_feedforward_without_a_solution_says_so_and_changes_no_output(gallery_mo
 
 def test_files_are_the_same_each_time(gallery_model, tmp_path):
     first = [f.read_text(encoding="utf-8") for f in export_c(gallery_model("vtol"), tmp_path / "a", name="vtol")]
-    assert first == [
-        f.read_text(encoding="utf-8") for f in export_c(gallery_model("vtol"), tmp_path / "b", name="vtol")
-    ]
+    assert first == [f.read_text(encoding="utf-8") for f in export_c(gallery_model("vtol"), tmp_path / "b", name="vtol")]
 
 
 def test_the_program_of_the_docs_prints_what_python_computes(gallery_model, tmp_path):
@@ -298,8 +292,6 @@ def test_marks_that_turn_or_hide_what_follows_reach_no_file(tmp_path):
     odd = "a\u202eb\u200b\u2028c\ud800\0d"
     array, no = Array("x", f"Any {odd}", (odd,)), Array("p", "None", ())
     routine = Routine("f", f"Any {odd}.", (Scalar("t"), array.input(), no.input(), array.output("y")))
-    contents = Contents(
-        [array, no], [Constant("half", 0.5, odd)], {"f": ca.Function("f", [t, x, p], [2 * x])}, [routine]
-    )
+    contents = Contents([array, no], [Constant("half", 0.5, odd)], {"f": ca.Function("f", [t, x, p], [2 * x])}, [routine])
     for file in write(tmp_path, "any", contents):
         assert all(letter.isprintable() or letter == "\n" for letter in Path(file).read_text(encoding="utf-8"))

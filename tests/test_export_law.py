@@ -203,8 +203,7 @@ def test_the_header_is_read_by_a_compiler_of_cplusplus(plan, tmp_path):
         pytest.skip("needs g++")
     source, header = sv.export_c(sv.lqr(plan, sv.plant(CRANE)), tmp_path, name="loop", thinned=1e-4)
     (tmp_path / "main.cpp").write_text(
-        '#include "loop.h"\nint main() { double y[LOOP_NY] = {}, z[1], u[LOOP_NU]; loop_start(z); return loop_step(0, y, z, u); }\n',
-        encoding="utf-8",
+        '#include "loop.h"\nint main() { double y[LOOP_NY] = {}, z[1], u[LOOP_NU]; loop_start(z); return loop_step(0, y, z, u); }\n', encoding="utf-8"
     )
     for command in (["gcc", "-std=c99", "-c", str(source), "-o", str(tmp_path / "loop.o")],
                     ["g++", "-Wall", "-Wextra", str(tmp_path / "main.cpp"), str(tmp_path / "loop.o"), "-o", str(tmp_path / "run")],

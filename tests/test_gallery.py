@@ -79,8 +79,7 @@ NUMBERS = {
     "two-link-arm": lambda run: (run["q2"][0], np.arccos((0.6**2 + 0.4**2 - 0.6**2 - 0.5**2) / (2 * 0.6 * 0.5))),
     "appell-hamel": largest("tension", closed_forms.appell_hamel),
     "two-cars-ideal": lambda run: (
-        np.abs(run.signals("reaction")[1][0]).max(),
-        np.abs(closed_forms.cars_ideal(run.t)["reaction"]).max(),
+        np.abs(run.signals("reaction")[1][0]).max(), np.abs(closed_forms.cars_ideal(run.t)["reaction"]).max(),
     ),  # fmt: skip
     "constant-speed": lambda run: (-run["y"][-1], -closed_forms.constant_speed(run.t)["y"][-1]),
     "spiral": lambda run: (run["y"][-1], closed_forms.spiral(run.t, 3)["y"][-1]),

@@ -32,9 +32,7 @@ def test_a_scene_runs_and_leaves_a_page_with_figures_that_can_be_read(name, draw
     """Each value prints itself in at most eight lines."""
     code, out = main(["run", name, "--out", str(tmp_path), "--all-figures"]), capsys.readouterr().out
     assert code == (1 if name in ENDS_EARLY else 0), out
-    assert max(lines_of_values(out)) <= MOST_LINES and "rank margins" in (tmp_path / "report.txt").read_text(
-        encoding="utf-8"
-    )
+    assert max(lines_of_values(out)) <= MOST_LINES and "rank margins" in (tmp_path / "report.txt").read_text(encoding="utf-8")
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["scene"]["name"] == name and (tmp_path / "index.html").stat().st_size < 2e6
     assert set(drawn) >= {"motion.png", "sheet.png", "coordinates.png", "residuals.png"}

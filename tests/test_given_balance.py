@@ -35,9 +35,7 @@ def test_a_balance_with_gravity_keeps_forces_and_power(inertia):
         assert np.abs(unlawful).max() < 1e-12 and rate == pytest.approx(work, abs=1e-12)
         assert sv.verify(runs[-1]).passed
     expected, run = runs
-    assert run["F"] == pytest.approx(expected["F"], abs=1e-12) and run["tau"] == pytest.approx(
-        expected["tau"], abs=1e-12
-    )
+    assert run["F"] == pytest.approx(expected["F"], abs=1e-12) and run["tau"] == pytest.approx(expected["tau"], abs=1e-12)
     plant = sv.plant(mechanism)
     closed = sv.close(plant, sv.lqr(run, plant), [0.1, 0.2, 1.0, 0.0], (0.0, 2.0))
     assert sv.verify(closed).passed and not sv.verify(closed).notes

@@ -8,13 +8,9 @@ import robots
 import servoctl as sv
 
 LEGS = ("front_left", "front_right", "hind_left", "hind_right")
-STANDING = {"base_z": 0.3} | {
-    f"{leg}_{joint}": angle for leg in LEGS for joint, angle in (("flexion", 0.7), ("knee", -1.4))
-}
+STANDING = {"base_z": 0.3} | {f"{leg}_{joint}": angle for leg in LEGS for joint, angle in (("flexion", 0.7), ("knee", -1.4))}
 TALOS = {"base_z": 1.0} | {
-    f"leg_{side}_{joint}_joint": angle
-    for side in ("left", "right")
-    for joint, angle in ((3, -0.5), (4, 1.0), (5, -0.5))
+    f"leg_{side}_{joint}_joint": angle for side in ("left", "right") for joint, angle in ((3, -0.5), (4, 1.0), (5, -0.5))
 }
 HELD = {  # file, kind of base, posture, frames
     "an arm at a wall": ("six_axis_arm", "fixed", {"lift": 0.2, "elbow": 1.4, "bend": 0.9}, {"tool": "position"}),
@@ -33,9 +29,7 @@ def contacts_of(other, frames, configuration):
         place = other.data.oMf[model.getFrameId(name)]
         size = pin.ContactType.CONTACT_3D if kind == "position" else pin.ContactType.CONTACT_6D
         contacts.append(
-            pin.RigidConstraintModel(
-                size, model, frame.parentJoint, frame.placement, 0, place, pin.ReferenceFrame.LOCAL
-            )
+            pin.RigidConstraintModel(size, model, frame.parentJoint, frame.placement, 0, place, pin.ReferenceFrame.LOCAL)
         )
     return contacts
 
@@ -67,11 +61,7 @@ def test_accelerations_of_held_robots_equal_pinocchio(scene):
     allowed = np.eye(q.n) - np.linalg.pinv(jacobian) @ jacobian
     plant = plant.near(0.0, np.concatenate([values, np.zeros(q.n)]))  # pivots of a symmetric stance
     for _ in range(5):
-        v, u, d = (
-            allowed @ random.normal(size=q.n),
-            20.0 * random.normal(size=len(plant.inputs)),
-            random.normal(size=q.n),
-        )
+        v, u, d = allowed @ random.normal(size=q.n), 20.0 * random.normal(size=len(plant.inputs)), random.normal(size=q.n)
         x = np.concatenate([values, v])
         driven = [q.names.index(name.removeprefix("torque_")) - (q.nq - q.n) for name in plant.inputs]
         torques = d.copy()

@@ -55,9 +55,7 @@ def test_without_noise_the_numbers_are_exact(crane):
     assert [found[name] for name in TRUE] == pytest.approx(list(TRUE.values()), rel=1e-7)
     assert found.plant.damping["x"] == found["damping_x"] and found.misfit < 1e-5
     assert found.plant.rates(0.0, [0, 4.0, 0.1, 1.0, 0, 0], [0.0, -1000.0]) == pytest.approx(
-        sv.plant(guess.mechanism, m_load=112.0, damping={"x": 25.0}).rates(
-            0.0, [0, 4.0, 0.1, 1.0, 0, 0], [0.0, -1000.0]
-        )
+        sv.plant(guess.mechanism, m_load=112.0, damping={"x": 25.0}).rates(0.0, [0, 4.0, 0.1, 1.0, 0, 0], [0.0, -1000.0])
     )
 
 

@@ -173,9 +173,7 @@ def test_a_start_that_names_a_coordinate_includes_it(beside, named):
     assert np.any([*sv.sensitivity(swung, to=["phi0"], of=["d2phi0"]).values.values()])
     many = sv.simulate_many(model, {"l": 4.0, "phi0": [0.1, 0.2]}, None, (0.0, 0.5)) if "phi0" in named else None
     assert many is None or many["final phi0"].min() > 0.1
-    assert including(including(model, ["phi0"]), ["phi0"]).reduction.left_out == () and model.reduction.left_out == (
-        "phi0",
-    )
+    assert including(including(model, ["phi0"]), ["phi0"]).reduction.left_out == () and model.reduction.left_out == ("phi0",)
 
 
 def test_keep_names_coordinates():

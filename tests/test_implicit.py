@@ -88,8 +88,7 @@ def test_order(order, steps, model, start):
 def test_error_follows_the_tolerance_at_all_samples(order, model, start):
     tolerances = (1e-4, 1e-6, 1e-8, 1e-10)
     runs = [
-        sv.simulate(model, start, (0.0, 2.0), method=sv.methods.RadauIIA(order=order, rtol=r, atol=r / 100))
-        for r in tolerances
+        sv.simulate(model, start, (0.0, 2.0), method=sv.methods.RadauIIA(order=order, rtol=r, atol=r / 100)) for r in tolerances
     ]
     errors = [error(run) for run in runs]
     assert all(e <= 100 * r for e, r in zip(errors, tolerances, strict=True)), errors

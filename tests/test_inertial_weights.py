@@ -53,10 +53,7 @@ def test_accelerations_are_nearest_to_the_wish_in_the_metric_of_the_inertia(kind
     arm, mechanism, pose = arm_and_pose() if kind == "posture" else leg_and_place()
     _, run = motion(kind)
     q = arm.q
-    wanted = {
-        "least": 0 * q.jet(1),
-        "posture": -9.0 * (q.jet(0) - ca.DM(arm.posture(HOME if kind == "posture" else {}))) - 6.0 * q.jet(1),
-    }.get(kind)
+    wanted = {"least": 0 * q.jet(1), "posture": -9.0 * (q.jet(0) - ca.DM(arm.posture(HOME if kind == "posture" else {}))) - 6.0 * q.jet(1)}.get(kind)
     if wanted is None:
         wanted = ca.vertcat(0, 0.3 * ca.sin(2 * q.t), 0)
     second = ca.vertcat(*(q.dt(row, 2) for row in pose.values()))
@@ -93,10 +90,7 @@ def test_a_wish_is_the_actuation_of_its_accelerations():
 
 def test_actuators_in_another_order_and_scale_give_the_same_motion():
     q = sv.coordinates("a b c")
-    S = sum(
-        sv.particle(q, m, (x, ca.sin(q["a"]) * q["b"]))
-        for m, x in ((1.0, q["a"]), (2.0, q["b"] + q["c"]), (3.0, q["c"]))
-    )
+    S = sum(sv.particle(q, m, (x, ca.sin(q["a"]) * q["b"])) for m, x in ((1.0, q["a"]), (2.0, q["b"] + q["c"]), (3.0, q["c"])))
     directions = {"u": [0, 2.0, 0], "v": [1.0, 0, 0.5], "w": [0, 0, -1.0]}
     runs = []
     for actuators in (dict(zip("uvw", q, strict=True)), directions):

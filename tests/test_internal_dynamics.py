@@ -182,12 +182,7 @@ def test_a_period_that_is_none_is_refused():
         (lambda x, v, t: 4 * x, 0.1, "neutral", (1.0, 1.5)),  # for so short a time nothing grows
         (lambda x, v, t: -0.3 * v - (-1 + 34 * ca.cos(15 * t)) * x, 40.0, "stable", (1.0, 10.0)),  # Kapitza's pendulum
         (lambda x, v, t: -2 * v - (3 - 6 / (1 + ca.exp(-2 * (t - 10)))) * x, 20.0, "unstable", (8e3, 2e4)),  # later
-        (
-            lambda x, v, t: -0.3 * v - x + 25 * ca.exp(-(((t - 50) / 0.5) ** 8)) * x,
-            100.0,
-            "unstable",
-            (20, 100),
-        ),  # once
+        (lambda x, v, t: -0.3 * v - x + 25 * ca.exp(-(((t - 50) / 0.5) ** 8)) * x, 100.0, "unstable", (20, 100)),  # once
     ],
 )
 def test_growth_is_that_of_the_motion_in_any_units(acceleration, length, verdict, growth, scale):
@@ -239,9 +234,7 @@ def test_the_plan_of_a_parametric_resonance_is_refused_by_inverse_dynamics():
     model = passive(mathieu(0.6))
     run, found = moved(model, 120.0)
     plant = sv.plant(run.model.reduction.mechanism)
-    with refused(
-        sv.errors.UnstableInternalDynamics, "lqr", verdict="unstable", growth=found.growth, states=("x", "dx")
-    ):
+    with refused(sv.errors.UnstableInternalDynamics, "lqr", verdict="unstable", growth=found.growth, states=("x", "dx")):
         sv.computed(run, plant)
     run, _ = moved(passive(mathieu(0.15)), 120.0)
     assert sv.computed(run, sv.plant(run.model.reduction.mechanism)).name == "computed"
@@ -301,9 +294,7 @@ def ball_on_a_table(radius=0.1, mass=1.0, table=2.0):
     """A ball that rolls on a turning table: unit quaternion and angular velocity in space. It is exactly neutral."""
     names = sv.coordinates("X Y phi e0 e1 e2 e3")
     X, Y, _, e0, e1, e2, e3 = names
-    spin = ca.vertcat(
-        ca.horzcat(-e1, -e2, -e3), ca.horzcat(e0, e3, -e2), ca.horzcat(-e3, e0, e1), ca.horzcat(e2, -e1, e0)
-    )
+    spin = ca.vertcat(ca.horzcat(-e1, -e2, -e3), ca.horzcat(e0, e3, -e2), ca.horzcat(-e3, e0, e1), ca.horzcat(e2, -e1, e0))
     V = ca.diagcat(ca.SX.eye(3), spin / 2)
     unit = e0**2 + e1**2 + e2**2 + e3**2 - 1
     q = names.with_quasi_velocities("vx vy s w1 w2 w3", V, invariants={"unit": unit})
@@ -331,9 +322,7 @@ def test_a_tilted_ball_in_its_own_axes_is_neutral(tilt, samples):
     """With body-fixed angular velocities: its centre moves in a circle at constant speed, at 2/7 of the table's rate."""
     table, names = 0.7, sv.coordinates("X Y e0 e1 e2 e3")
     X, Y, e0, e1, e2, e3 = names
-    spin = ca.vertcat(
-        ca.horzcat(-e1, -e2, -e3), ca.horzcat(e0, -e3, e2), ca.horzcat(e3, e0, -e1), ca.horzcat(-e2, e1, e0)
-    )
+    spin = ca.vertcat(ca.horzcat(-e1, -e2, -e3), ca.horzcat(e0, -e3, e2), ca.horzcat(e3, e0, -e1), ca.horzcat(-e2, e1, e0))
     unit = e0**2 + e1**2 + e2**2 + e3**2 - 1
     q = names.with_quasi_velocities("vx vy w1 w2 w3", ca.diagcat(ca.SX.eye(2), spin / 2), invariants={"unit": unit})
     vx, vy, *w = q.w()
@@ -400,9 +389,7 @@ def test_samples_that_resolve_nothing_are_inconclusive():
 # the bound that settles whether there is anything to warn of ----------------------------------------------------------
 
 
-QUIET = sorted(
-    {*CERTIFIED, "reaction-wheels", "trailers"} - {"vtol-centre", "appell-hamel-squared", "constant-speed-horizontal"}
-)
+QUIET = sorted({*CERTIFIED, "reaction-wheels", "trailers"} - {"vtol-centre", "appell-hamel-squared", "constant-speed-horizontal"})
 
 
 @pytest.mark.parametrize("name", QUIET)
@@ -545,10 +532,7 @@ def test_tangents_span_the_kernel_of_the_gradients(name, gallery_model):
 
 def test_errors_of_states_on_which_nothing_depends_stay(gallery_model):
     model = gallery_model("appell-hamel")
-    assert [name for name, active in zip(model.state_names, active_states(model), strict=True) if not active] == [
-        "x",
-        "y",
-    ]
+    assert [name for name, active in zip(model.state_names, active_states(model), strict=True) if not active] == ["x", "y"]
     assert gallery_model("pendubot").active_states.all()
     x = model.start(x=0.0, y=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=0.5).values
     kept = along(model, 18, np.linspace(0.0, 10.0, 33), x, 1 + np.arange(10.0))
@@ -598,9 +582,7 @@ def test_propagators_that_shrink_beyond_rounding_are_multiplied_one_by_one():
 
 
 @pytest.mark.usefixtures("c_compiler")
-@pytest.mark.parametrize(
-    "span, t_eval", [((0.0, 10.0), None), ((10.0, 0.0), None), ((0.0, 10.0), [5.0, 10.0])], ids=str
-)
+@pytest.mark.parametrize("span, t_eval", [((0.0, 10.0), None), ((10.0, 0.0), None), ((0.0, 10.0), [5.0, 10.0])], ids=str)
 def test_neutral_growth_above_ten_takes_no_linearisation(span, t_eval, gallery_model, monkeypatch):
     """The wheel of Appell and Hamel turns back; its errors grow thirtyfold, but not exponentially."""
     model = gallery_model("appell-hamel").with_parameters(I_x=0.1125, I_y=0.225)

@@ -268,8 +268,7 @@ def test_margins_tell_the_delay_at_which_the_loop_is_lost(car_plan):
     _, pm, _, _, wgc, _ = control.stability_margins(control.frequency_response(gain, w))
     samples = np.deg2rad(pm) / wgc * 100.0
     stable = [
-        np.abs(interop.linearise(sv.close(plant, law, car_plan.state(0.0), (0.0, 6.0), timing=t), end).poles()).max()
-        < 1
+        np.abs(interop.linearise(sv.close(plant, law, car_plan.state(0.0), (0.0, 6.0), timing=t), end).poles()).max() < 1
         for t in (sv.Timing(delay=int(np.floor(samples))), sv.Timing(delay=int(np.ceil(samples))))
     ]
     assert stable == [True, False]

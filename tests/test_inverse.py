@@ -173,9 +173,7 @@ def test_a_rough_path_gets_a_relaxed_plan():
 
 
 def test_limits_within_which_the_exact_plan_lies_change_nothing():
-    run = sv.inverse(
-        *overhead_crane(), (0.0, 8.0), start={"l": 4.0}, limits={"trolley": 140.0}, bounds={"tension": (0, None)}
-    )
+    run = sv.inverse(*overhead_crane(), (0.0, 8.0), start={"l": 4.0}, limits={"trolley": 140.0}, bounds={"tension": (0, None)})
     assert run.method == "algebraic"
 
 
@@ -293,9 +291,7 @@ def test_an_upright_pole_falls_along_a_forward_plan_and_has_a_relaxed_one(recwar
     program = sv.Program({"v": mechanism.q.d(1)[0] - 1 - 0.2 * ca.sin(3 * mechanism.q.t)})
     for choice in ({}, {"method": "relaxed"}):
         run = sv.inverse(mechanism, program, (0.0, 6.0), start={"dx": 1.0}, **choice)
-        assert (
-            np.abs(run["a"][run.t > 2.0]).max() == pytest.approx(0.6 / 14.31, rel=0.02) and "begins on" in run.message
-        )
+        assert np.abs(run["a"][run.t > 2.0]).max() == pytest.approx(0.6 / 14.31, rel=0.02) and "begins on" in run.message
         assert np.abs(run.residual["v"]).max() < 1e-3 * 0.4 and not recwarn.list
     assert "unstable over these 6 s" in sv.inverse(mechanism, program, (0.0, 6.0), start={"dx": 1.0}).message
 

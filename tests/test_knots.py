@@ -223,9 +223,7 @@ def test_a_residual_may_be_named_like_a_force():
 
 @pytest.mark.parametrize("backwards", [False, True])
 @pytest.mark.parametrize("included", [False, True])
-@pytest.mark.parametrize(
-    "options", [{"method": "Taylor"}, {"method": sv.methods.Taylor(jets=4)}, {"accuracy": 1e-6}, {}]
-)
+@pytest.mark.parametrize("options", [{"method": "Taylor"}, {"method": sv.methods.Taylor(jets=4)}, {"accuracy": 1e-6}, {}])
 def test_a_sample_on_a_jump_of_a_force_has_the_acceleration_of_that_instant(options, included, backwards):
     q = sv.coordinates("x y")
     x, y = q

@@ -48,18 +48,8 @@ BOTH = pytest.mark.parametrize(("loops", "evaluated"), [((), on_grid), (("law",)
 def test_sine_and_cosine_are_within_two_units(loops, evaluated):
     rng = np.random.default_rng(2)
     turns = np.arange(-60, 61) * np.pi / 2
-    a = np.concatenate(
-        [
-            rng.uniform(-10, 10, 200),
-            rng.uniform(-1e5, 1e5, 100),
-            UNREDUCED,
-            -UNREDUCED,
-            turns,
-            np.nextafter(turns, 99),
-            63661 * np.pi / 2 + np.linspace(-1e-9, 1e-9, 5),
-            [0.0, -0.0, TINY, -TINY, LAST_SMALL, 1e-5],
-        ]
-    )
+    a = np.concatenate([rng.uniform(-10, 10, 200), rng.uniform(-1e5, 1e5, 100), UNREDUCED, -UNREDUCED, turns, np.nextafter(turns, 99),
+                        63661 * np.pi / 2 + np.linspace(-1e-9, 1e-9, 5), [0.0, -0.0, TINY, -TINY, LAST_SMALL, 1e-5]])
     y = evaluated(compiled(function(ca.sin(X2[0]), ca.cos(X2[0])), "circular", loops=loops), np.vstack([a, a]))
     with mpmath.workdps(40):
         exact = np.array([[float(f(mpmath.mpf(v))) for v in a] for f in (mpmath.sin, mpmath.cos)])

@@ -187,10 +187,7 @@ def test_errors_of_modelling_and_of_integration_are_told_apart(three):
 
 
 def test_operations_do_not_depend_on_the_machine_and_order_the_models(three):
-    for study, order in (
-        (three, ("linear", "plain", "friction")),
-        (ropes(methods={"algebraic": 0.1}), ("rigid", "elastic")),
-    ):
+    for study, order in ((three, ("linear", "plain", "friction")), (ropes(methods={"algebraic": 0.1}), ("rigid", "elastic"))):
         counts = [set(study.where(model=model)["operations"]) for model in order]
         assert all(len(count) == 1 for count in counts) and counts == sorted(counts, key=min)
     assert np.all(np.isfinite(three["seconds"])) and np.all(three["evaluations"] > 0)
@@ -198,7 +195,6 @@ def test_operations_do_not_depend_on_the_machine_and_order_the_models(three):
 
 def test_a_stiff_model_is_measured_by_an_implicit_method_too():
     """A damped spring with a time constant of 0.5 ms: 2,000 of them in the span."""
-
     def coupled(stiff=True):
         q = sv.coordinates("x y")
         x, y = q
@@ -303,9 +299,7 @@ def test_a_recommendation_holds_at_all_instants(three):
     """The recommended motion is compared with the reference's where nothing was measured."""
     t = np.sort(np.random.default_rng(5).uniform(0.0, 4.0, 3000))
     model = PENDULA["friction"]()
-    exact = sv.simulate(
-        model, model.start(), (0.0, 4.0), sv.methods.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=t
-    )
+    exact = sv.simulate(model, model.start(), (0.0, 4.0), sv.methods.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=t)
     for error in (0.5, 0.2, 1e-4, 1e-6, 1e-9):
         best = three.recommend(error=error)
         model = PENDULA[best.row["model"]]()
@@ -336,9 +330,7 @@ def test_a_study_of_models_is_saved_printed_and_drawn(three, tmp_path):
     assert len(lines) <= 12 and max(map(len, lines)) <= 120 and lines[4].split()[0] == "model"
     axes = three.plot(title="pendula")
     legend = axes.get_legend()
-    labels = {
-        key.get_text(): line.get_color() for key, line in zip(legend.get_texts(), legend.get_lines(), strict=True)
-    }
+    labels = {key.get_text(): line.get_color() for key, line in zip(legend.get_texts(), legend.get_lines(), strict=True)}
     best = set(three.pareto()["model"])
     assert {name for name, colour in labels.items() if colour in COLOURS} == best
     assert all(any(name in label for label in labels) for name in PENDULA)

@@ -51,7 +51,6 @@ def each_equals_simulate(model, many, start, span, method, rtol=1e-12):
 
 def in_lanes(monkeypatch):
     """Forbid the ordinary method."""
-
     def refuse(*_, **__):
         raise AssertionError("a case left the lanes")
 
@@ -70,14 +69,7 @@ def test_parameters_in_lanes_equal_simulate(span, gallery_model, monkeypatch, c_
     each_equals_simulate(model, many, start, span, sv.methods.Taylor())
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        sv.methods.Taylor(),
-        sv.methods.Taylor(8, rtol=1e-5, atol=1e-7),
-        sv.methods.Taylor(jets=9, rtol=1e-10, atol=1e-12),
-    ],
-)
+@pytest.mark.parametrize("method", [sv.methods.Taylor(), sv.methods.Taylor(8, rtol=1e-5, atol=1e-7), sv.methods.Taylor(jets=9, rtol=1e-10, atol=1e-12)])
 def test_starts_by_name_and_by_state_equal_simulate(method, monkeypatch, c_compiler):
     model = pendulum()
     angles = np.append(np.random.default_rng(SEED).uniform(-3, 3, 9), [0.0, np.pi])
@@ -216,13 +208,8 @@ def test_other_methods_run_one_by_one(gallery_model):
 
 @pytest.mark.parametrize(
     ("name", "span"),
-    [
-        ("overhead-crane", (0.0, 6.0)),
-        ("overhead-crane", (4.0, 1.0)),
-        ("crane-3d", (0.0, 2.0)),
-        ("two-cars", (0.0, 2.0)),
-        ("winch-crane-redundant", (0.5, 2.0)),
-    ],
+    [("overhead-crane", (0.0, 6.0)), ("overhead-crane", (4.0, 1.0)), ("crane-3d", (0.0, 2.0)), ("two-cars", (0.0, 2.0)),
+     ("winch-crane-redundant", (0.5, 2.0))],
 )
 def test_plans_over_parameters_equal_simulate(name, span, gallery_model, monkeypatch, c_compiler):
     scene, model = gallery[name], gallery_model(name)
@@ -314,7 +301,6 @@ def test_an_interrupt_leaves_the_finished_cases(monkeypatch):
 
 def test_an_interrupt_ends_the_lanes_at_once(monkeypatch, c_compiler):
     """The cases that were finished are kept, and no case is computed by itself afterwards."""
-
     def stop(bar, count):
         raise KeyboardInterrupt
 
@@ -351,11 +337,8 @@ def test_without_a_compiler_the_results_are_the_same(monkeypatch, c_compiler):
         ({"starts": {"a": [0.1, 0.2], "da": [0.0]}}, SpecificationError, {"lengths": [1, 2]}),
         ({"starts": np.zeros((3, 2))}, SpecificationError, {}),
         ({"starts": {"a": [np.nan], "da": 0.0}}, SpecificationError, {}),
-        (
-            {"starts": {"a": [0.1] * 3, "da": 0.0}, "parameters": {"k": [1.0, 2.0]}},
-            SpecificationError,
-            {"lengths": [2, 3]},
-        ),
+        ({"starts": {"a": [0.1] * 3, "da": 0.0}, "parameters": {"k": [1.0, 2.0]}}, SpecificationError,
+         {"lengths": [2, 3]}),
         ({"t_eval": [2.0]}, SpecificationError, {"t_eval": [2.0]}),
         ({"executor": 0}, SpecificationError, {}),
         ({"executor": "two"}, SpecificationError, {}),
@@ -397,8 +380,7 @@ def test_derivations_are_affirmed_for_each_set_of_parameters_by_itself(gallery_m
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["appell-hamel", "overhead-crane", "winch-crane", "mass-on-car", "two-link-arm", "wheeled-robot", "four-bar"],
+    "name", ["appell-hamel", "overhead-crane", "winch-crane", "mass-on-car", "two-link-arm", "wheeled-robot", "four-bar"]
 )
 def test_derivations_are_affirmed_at_once_where_they_hold(name, gallery_model):
     """Parameters of the balances, of the constraints, and of both; what is plainly valid holds in extended precision."""
@@ -433,16 +415,9 @@ def signals_equal_runs(model, many, start, span, method=None, names=None):
 
 @pytest.mark.parametrize(
     ("name", "span"),
-    [
-        ("overhead-crane", (0.0, 6.0)),
-        ("crane-3d", (2.0, 0.0)),
-        ("appell-hamel", (0.0, 1.0)),
-        ("rolling-disc", (0.0, 0.5)),
-        ("reaction-wheels", (0.0, 0.3)),
-        ("flexible-joint", (0.0, 1.0)),
-        ("ball-on-turntable", (0.0, 0.5)),
-        ("constant-jerk", (0.0, 0.2)),
-    ],
+    [("overhead-crane", (0.0, 6.0)), ("crane-3d", (2.0, 0.0)), ("appell-hamel", (0.0, 1.0)), ("rolling-disc", (0.0, 0.5)),
+     ("reaction-wheels", (0.0, 0.3)), ("flexible-joint", (0.0, 1.0)), ("ball-on-turntable", (0.0, 0.5)),
+     ("constant-jerk", (0.0, 0.2))],
 )
 @pytest.mark.parametrize("count", [0, 5])
 def test_motions_have_the_signals_of_a_run(name, span, count, gallery_model):
@@ -477,9 +452,7 @@ def test_forces_of_a_pendulum_against_their_closed_form(c_compiler):
     a, da, dda = (many.trace[name] for name in ("a", "da", "d2a"))
     np.testing.assert_allclose(dda, -9.81 * np.sin(a), atol=1e-11)
     np.testing.assert_allclose(many.trace["F"], m * (np.cos(a) * dda - np.sin(a) * da**2), atol=1e-10)
-    few = sv.simulate_many(
-        model, {"a": 1.0, "da": 0.0}, {"m": m[:2]}, (0.0, 1.0), sv.methods.Taylor(jets=4), t_eval=t[:3]
-    )
+    few = sv.simulate_many(model, {"a": 1.0, "da": 0.0}, {"m": m[:2]}, (0.0, 1.0), sv.methods.Taylor(jets=4), t_eval=t[:3])
     d3a = -9.81 * np.cos(few.trace["a"]) * few.trace["da"]
     np.testing.assert_allclose(few.trace["d3a"], d3a, atol=1e-10)
     rate = np.cos(few.trace["a"]) * d3a - 3 * np.sin(few.trace["a"]) * few.trace["da"] * few.trace["d2a"]
@@ -522,9 +495,7 @@ def test_an_executor_computes_the_same_bits(pool, gallery_model, c_compiler):
     with pool(2) as executor:
         for problem in problems:
             options = {"t_eval": [problem[3][1] / 2], "progress": False}
-            same_motions(
-                sv.simulate_many(*problem, **options, executor=executor), sv.simulate_many(*problem, **options)
-            )
+            same_motions(sv.simulate_many(*problem, **options, executor=executor), sv.simulate_many(*problem, **options))
 
 
 class Broken(Executor):

@@ -59,9 +59,7 @@ def test_the_compiled_recursion_is_that_of_numpy(n, m, of_state, monkeypatch, c_
 
 def test_few_matrices_are_left_to_numpy_and_many_of_a_size_compiled_once(monkeypatch, c_compiler):
     asked, library = [], compiler.library
-    monkeypatch.setattr(
-        compiler, "library", lambda text, *given, **options: asked.append(text) or library(text, *given, **options)
-    )
+    monkeypatch.setattr(compiler, "library", lambda text, *given, **options: asked.append(text) or library(text, *given, **options))
     for count in (1, FEWEST_COMPILED, FEWEST_COMPILED + 1, FEWEST_COMPILED + 2):
         exponentials(np.zeros((count, 2, 2)), np.ones((2, 2)), np.zeros(count, dtype=int), TERMS)
     assert len(asked) == 2 and len(set(asked)) == 1

@@ -304,9 +304,7 @@ def test_what_was_read_takes_other_numbers_as_what_was_derived(derived):
 def test_other_pivots_are_kept_too(derived):
     early, late = (sv.derive(*gallery["overhead-crane"].build()) for _ in range(2))
     jets = np.array([0.0, 4.0, 0.1, *np.full(6, 0.1)])
-    found = [
-        derived_near(model, 0.3, jets).function("path")(0.3, jets[:3], model.parameters) for model in (early, late)
-    ]
+    found = [derived_near(model, 0.3, jets).function("path")(0.3, jets[:3], model.parameters) for model in (early, late)]
     assert len(derived) == 2 and np.array_equal(*found)
 
 

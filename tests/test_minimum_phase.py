@@ -69,9 +69,7 @@ def zeros_of_the_plant(model, value, parameter, at):
     M, D, K, E, C = (np.array(a) for a in f(at.t, at.values[:n], u, p))
     k = len(C)
     A = np.block([[np.zeros((n, n)), np.eye(n), np.zeros((n, k))], [-K, -D, E], [C, np.zeros((k, n + k))]])
-    B = np.block(
-        [[np.eye(n), np.zeros((n, n + k))], [np.zeros((n, n)), M, np.zeros((n, k))], [np.zeros((k, 2 * n + k))]]
-    )
+    B = np.block([[np.eye(n), np.zeros((n, n + k))], [np.zeros((n, n)), M, np.zeros((n, k))], [np.zeros((k, 2 * n + k))]])
     alpha, beta = eig(A, B, right=False, homogeneous_eigvals=True)
     finite = np.abs(beta) > 1e-7 * np.abs(alpha)
     roots = alpha[finite] / beta[finite]
@@ -395,9 +393,7 @@ def test_a_relative_degree_that_is_lost_at_the_rest_itself_is_found():
     p, q = sv.parameters(w=0.5), sv.coordinates("x y")
     (x, y), (dx, dy) = q, q.d(1)
     masses, springs = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y), 2.0 * (x - y) ** 2 + 3.0 * x**2
-    mechanism = sv.Mechanism(
-        q, masses, potential=springs, forces=(-0.1 * dx, -0.1 * dy), actuators={"a": y}, parameters=p
-    )
+    mechanism = sv.Mechanism(q, masses, potential=springs, forces=(-0.1 * dx, -0.1 * dy), actuators={"a": y}, parameters=p)
     path = sv.paths.rest_to_rest(q.t, 0.0, 0.1, duration=1.0, smoothness=4)
     found = sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x + p.w * y + y**2 - path})), "w", (-1.0, 1.0))
     assert [lost["y"] for lost in found.lost(0.5)] == pytest.approx([-0.25])  # where ∂X/∂y = w + 2y vanishes

@@ -26,12 +26,7 @@ def test_an_instant_that_pieces_share_is_one_sample(room):
     assert motion.variants() == [(0, 5, "a"), (5, 6, "b"), (6, 7, "a")]
     assert [(model, t.tolist()) for model, t, _ in motion.by_piece()] == [
         ("a", [0, 1, 2]), ("a", [3, 4]), ("b", [5]), ("a", [6])]  # fmt: skip
-    assert [motion.t[first:end].tolist() for _, first, _, end in motion.pieces] == [
-        [0, 1, 2],
-        [2, 3, 4],
-        [4, 5],
-        [5, 6],
-    ]
+    assert [motion.t[first:end].tolist() for _, first, _, end in motion.pieces] == [[0, 1, 2], [2, 3, 4], [4, 5], [5, 6]]
 
 
 @pytest.mark.parametrize("end, left", [(4.0, [0, 1, 2, 3]), (3.0, [0, 1, 2]), (2.0, [0, 1]), (0.0, [])])
@@ -95,6 +90,4 @@ def test_motions_from_one_start_derive_their_variants_once(monkeypatch):
     place = place_of(runs[0].variants[-1][2])
     for k in range(MOST_VARIANTS):
         variant_at(model, (1e-3 * (k + 1), *place[1:]))
-    assert (
-        variant_at(model, place) is not runs[0].variants[-1][2] and variant_at(model, place) == runs[0].variants[-1][2]
-    )
+    assert variant_at(model, place) is not runs[0].variants[-1][2] and variant_at(model, place) == runs[0].variants[-1][2]

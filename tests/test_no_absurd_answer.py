@@ -7,15 +7,7 @@ import pytest
 FOLDER = Path(__file__).parent
 ORIGIN, NAMES, SETS, TWICE, PASSED, DOOR, START = (
     f"test_{name}.py"
-    for name in (
-        "no_special_origin",
-        "one_name",
-        "exceptional_sets",
-        "described_twice",
-        "what_passed_means",
-        "at_the_door",
-        "start",
-    )
+    for name in ("no_special_origin", "one_name", "exceptional_sets", "described_twice", "what_passed_means", "at_the_door", "start")
 )
 ROWS = {
     "a guess 5 cm off a damped crane: 39 m/s and 308,000 N": (ORIGIN, "a_damped_crane_starts_at_rest"),

@@ -34,10 +34,8 @@ def by_numpy(key, counter):
 @pytest.mark.parametrize("name", WORDS)
 def test_words_are_those_of_numpy_and_the_known_ones(name):
     key, counter = WORDS[name]
-    text = (
-        emit.unit({"NAME": "words"})
-        + emit.include("normal.h")
-        + ("void all(const uint64_t *k, const uint64_t *c, uint64_t *y) { philox(k, c[0], c[1], c[2], y); }\n")
+    text = emit.unit({"NAME": "words"}) + emit.include("normal.h") + (
+        "void all(const uint64_t *k, const uint64_t *c, uint64_t *y) { philox(k, c[0], c[1], c[2], y); }\n"
     )
     y = np.empty(4, dtype=np.uint64)
     arrays = [np.array(values, dtype=np.uint64) for values in (key, counter)]

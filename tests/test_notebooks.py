@@ -81,9 +81,7 @@ def test_a_notebook_is_valid_asserts_its_numbers_and_has_its_outputs(path):
     assert sum("assert " in cell.source for cell in code) >= 4
     assert all(cell.execution_count for cell in code) and path.stat().st_size < MOST_BYTES
     assert not [o for cell in code for o in cell.outputs if o.output_type == "error" or o.get("name") == "stderr"]
-    assert all(
-        "<table" in o.data["text/html"] for cell in code for o in cell.outputs if "text/html" in o.get("data", {})
-    )
+    assert all("<table" in o.data["text/html"] for cell in code for o in cell.outputs if "text/html" in o.get("data", {}))
     assert text[0].source.startswith("# ") and code[0].outputs is not None
     ids = [cell.id for cell in (*code, *text)]
     assert len(ids) == len(set(ids))

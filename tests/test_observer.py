@@ -82,9 +82,7 @@ def test_noise_costs_less_than_differencing_would(crane):
     costs = []
     for given in (sv.output_feedback(law, nominal, SENSORS), Differencing(law, SENSORS)):
         noisy, quiet = (
-            sv.close(
-                machine, given, plan.state(0.0), (0.0, 8.0), timing=sv.Timing(rate=100.0), sensors=sensors, plan=plan
-            )
+            sv.close(machine, given, plan.state(0.0), (0.0, 8.0), timing=sv.Timing(rate=100.0), sensors=sensors, plan=plan)
             for sensors in (sv.Sensors(noise=SENSORS, seed=3), sv.Sensors())
         )
         costs.append(np.std(noisy.commands - quiet.commands, axis=1))

@@ -166,9 +166,7 @@ def test_the_choice_follows_hidden_rows_where_the_decoupling_is_singular(weights
                       guess={"l": 4.0, "Z": 4.0} if rope == "redundant" else {"l": 4.0})  # fmt: skip
     assert model.free == 2 and len(model.reduction.hidden) == 1
     start = model.start(guess={"l": 4.0, "Z": 4.0} if rope == "redundant" else {"l": 4.0}, s=0.2)
-    run = sv.simulate(
-        model, start, (0.0, 6.0), sv.methods.Adaptive(rtol=1e-11, atol=1e-12), t_eval=np.linspace(0.0, 6.0, 61)
-    )
+    run = sv.simulate(model, start, (0.0, 6.0), sv.methods.Adaptive(rtol=1e-11, atol=1e-12), t_eval=np.linspace(0.0, 6.0, 61))
     one = sv.simulate(crane_plan.model, crane_plan.model.start(guess={"l": 4.0}), (0.0, 6.0), t_eval=run.t)
     expected = share(one["trolley"], weights, {"cart": -40.0 * run["ds"] - 30.0 * run["s"]})
     for name, values in expected.items():
@@ -307,10 +305,7 @@ def test_exact_linearisation_goes_round_a_full_turn(machine, span):
     plant = sv.plant(mechanism)
     law = sv.computed(run, plant, rate=200.0)
     assert law.info["orders"] == {"X": 4, "Y": 4}
-    a, jerk = (
-        4 * np.array([-2 * np.cos(span[0]), -np.sin(span[0])]),
-        4 * np.array([2 * np.sin(span[0]), -np.cos(span[0])]),
-    )
+    a, jerk = 4 * np.array([-2 * np.cos(span[0]), -np.sin(span[0])]), 4 * np.array([2 * np.sin(span[0]), -np.cos(span[0])])
     assert law.state == pytest.approx([np.hypot(*a), a @ jerk / np.hypot(*a)], abs=1e-6)
     loop = sv.close(plant, law, run.state(span[0]), span)
     assert max(np.abs(values[0]).max() for values in loop.residual.values()) < 1e-3
@@ -611,8 +606,6 @@ def test_wishes_with_unknown_symbols_are_refused():
         sv.derive(mechanism, sv.Program(program.residuals, toward={"fore": ca.SX.sym("stray")}))
 
 
-@pytest.mark.parametrize(
-    ("weights", "norm"), [(None, "norm"), ("inertia", "weighted norm"), ({"shoulder": 2.0}, "weighted norm")]
-)
+@pytest.mark.parametrize(("weights", "norm"), [(None, "norm"), ("inertia", "weighted norm"), ({"shoulder": 2.0}, "weighted norm")])
 def test_a_model_names_the_norm_that_is_least(weights, norm):
     assert f": of least {norm};" in repr(sv.derive(*arm(weights)))

@@ -62,9 +62,7 @@ def test_times_of_samples_that_rounding_puts_beyond_the_span_are_its_ends(method
 
 def test_whole_numbers(scene):
     for options in ({"order": True}, {"order": 5.0}, {"order": "a"}, {"jets": True}, {"jets": 2.5}):
-        stopped(
-            next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method=sv.methods.Taylor(**options))
-        )
+        stopped(next(iter(options)), lambda options=options: sv.simulate(*scene, SPAN, method=sv.methods.Taylor(**options)))
     run = sv.simulate(*scene, SPAN, method=sv.methods.Taylor(order=np.int64(8), jets=np.int64(3)), t_eval=[0.0, 0.2])
     assert "d3theta" in run.names
     for every in (True, 0, 1.0):
@@ -189,9 +187,7 @@ def test_what_a_figure_of_stability_is_asked_for(scene):
     assert list(left.lines[0].get_xdata()) == list(right.lines[0].get_xdata()) == [10.0, 100.0]
 
 
-@pytest.mark.parametrize(
-    "count", [2**63 + 10**6, 2**64, 1e300, 10**400, 10**9 + 1], ids=["2**63", "2**64", "1e300", "10**400", "1e9"]
-)
+@pytest.mark.parametrize("count", [2**63 + 10**6, 2**64, 1e300, 10**400, 10**9 + 1], ids=["2**63", "2**64", "1e300", "10**400", "1e9"])
 def test_counts_stay_within_what_the_loops_can_hold(count):
     """Counts enter C as 64 bits: beyond them a loop would end the process, or do something else in silence."""
     for name in ("delay", "substeps"):
@@ -208,11 +204,7 @@ def test_counts_stay_within_what_the_loops_can_hold(count):
 
 def test_values_of_a_call_hash_like_they_compare():
     pairs = [
-        (
-            sv.methods.Poles({"X": [-5.0, -6.0]}),
-            sv.methods.Poles({"X": [-5.0, -6.0]}),
-            sv.methods.Poles({"X": [-5.0, -7.0]}),
-        ),
+        (sv.methods.Poles({"X": [-5.0, -6.0]}), sv.methods.Poles({"X": [-5.0, -6.0]}), sv.methods.Poles({"X": [-5.0, -7.0]})),
         (sv.methods.Poles(0.1), sv.methods.Poles(0.1), sv.methods.Poles(0.2)),
         (sv.Sensors({"x": 1e-3}, seed=1), sv.Sensors({"x": 1e-3}, seed=1), sv.Sensors({"x": 1e-3}, seed=2)),
         (sv.Timing(100.0, 1), sv.Timing(100.0, 1), sv.Timing(100.0, 2)),

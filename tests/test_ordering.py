@@ -34,9 +34,7 @@ def fewest(model, start, span, method, exact, t):
 def test_taylor_then_dop853_then_rk45_then_rk4(name, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     start, t = model.start(guess=scene.guess, **scene.start), np.linspace(*scene.t_span, INTERVALS + 1)
-    exact = sv.simulate(
-        model, start, scene.t_span, sv.methods.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=t
-    ).jets
+    exact = sv.simulate(model, start, scene.t_span, sv.methods.Adaptive("DOP853", rtol=3e-14, atol=1e-15), t_eval=t).jets
     costs = [fewest(model, start, scene.t_span, m, exact, t) for m in ("Taylor", "DOP853", "RK45", "RK4")]
     evaluations, operations = zip(*costs, strict=True)
     assert list(evaluations) == sorted(set(evaluations))

@@ -110,9 +110,7 @@ def test_residuals_with_steep_blends_are_kept(method):
 def test_a_loop_meets_a_wall():
     mechanism, _ = wall(lambda s: E(s) / (1 + E(s)), 1000.0, "force")
     plant = sv.plant(mechanism)
-    run = sv.close(
-        plant, lambda t, y: {"F": 0.0, "G": 0.5}, [0.0, -1.0, 0.0, 0.0], (0.0, 3.0), timing=sv.Timing(rate=200.0)
-    )
+    run = sv.close(plant, lambda t, y: {"F": 0.0, "G": 0.5}, [0.0, -1.0, 0.0, 0.0], (0.0, 3.0), timing=sv.Timing(rate=200.0))
     assert run.success and run["y"].max() > 1.0
     A, B = plant.linearised(run.t, run.states, run.inputs)
     assert np.isfinite(A).all() and np.isfinite(B).all()

@@ -105,12 +105,7 @@ def crane(law):
     q = sv.coordinates("x l theta s")
     x, l, theta, s = q
     load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
-    S = (
-        sv.particle(q, p.m_trolley, x)
-        + sv.particle(q, p.m_hoist, l)
-        + sv.particle(q, p.m_load, load)
-        + q.d(2)[3] ** 2 / 2
-    )
+    S = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load) + q.d(2)[3] ** 2 / 2
     mechanism = sv.Mechanism(
         q, S, potential=-p.m_load * p.g * load[1], actuators={"trolley": x, "hoist": l, "pace": s}, parameters=p,
         outputs={"Xdot": q.dt(load[0]), "X": load[0], "Z": load[1]},

@@ -277,10 +277,7 @@ def test_a_plan_through_twelve_parameters_pushes_as_its_spline_does():
         (lambda: paths.rest_to_rest(ca.MX.sym("t"), 0, 1, 1.0), ["t is a MX"]),
         (lambda: paths.rest_to_rest(coordinates("x y"), 0, 1, 1.0), ["t has 2 entries"]),
         (lambda: paths.trapezoid(T, 1, duration=2.0, ramp=1.5), ["1.5 s", "2 s", "A ramp of 1 s"]),
-        (
-            lambda: paths.trapezoid(T, 1, duration=2.0, ramp=1.0, smoothness=0),
-            ["smoothness=0", "from 1", "smoothness=1"],
-        ),
+        (lambda: paths.trapezoid(T, 1, duration=2.0, ramp=1.0, smoothness=0), ["smoothness=0", "from 1", "smoothness=1"]),
         (lambda: paths.circle(T, (0, 0), -1.0), ["radius=-1", "greater than 0"]),
         (lambda: paths.circle(T, (0, 0, 0), 1.0), ["3 entries", "no axes"]),
         (lambda: paths.circle(T, (0, 0, 0), 1.0, ((1, 0), (0, 1))), ["centre has 3", "axes[0] has 2"]),

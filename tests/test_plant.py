@@ -107,16 +107,8 @@ def test_the_load_hangs_the_same_on_a_rope_that_is_a_constraint():
     u, x0 = [20.0, -980.0], {"x": 0.0, "l": 4.0, "theta": 0.3, "dx": 0.0, "dl": 0.0, "dtheta": 0.5}
     s, c = np.sin(0.3), np.cos(0.3)
     redundant = {"x": 0.0, "l": 4.0, "X": 4 * s, "Z": 4 * c, "dx": 0.0, "dl": 0.0, "dX": 2 * c, "dZ": -2 * s}
-    a = sv.close(
-        sv.plant(RELATIVE, m_load=115.0), lambda t, y: u, x0, (0.0, 2.0), timing=sv.Timing(rate=100.0, substeps=8)
-    )
-    b = sv.close(
-        sv.plant(REDUNDANT, m_load=115.0),
-        lambda t, y: u,
-        redundant,
-        (0.0, 2.0),
-        timing=sv.Timing(rate=100.0, substeps=8),
-    )
+    a = sv.close(sv.plant(RELATIVE, m_load=115.0), lambda t, y: u, x0, (0.0, 2.0), timing=sv.Timing(rate=100.0, substeps=8))
+    b = sv.close(sv.plant(REDUNDANT, m_load=115.0), lambda t, y: u, redundant, (0.0, 2.0), timing=sv.Timing(rate=100.0, substeps=8))
     assert b["x"] == pytest.approx(a["x"], abs=1e-8) and b["l"] == pytest.approx(a["l"], abs=1e-8)
     assert b["X"] == pytest.approx(a["x"] + a["l"] * np.sin(a["theta"]), abs=1e-8)
     assert b["tension"] == pytest.approx(a["tension"], rel=1e-7)
@@ -148,9 +140,7 @@ def test_a_free_body_in_unit_quaternions_keeps_energy_and_unit():
 def test_the_loop_integrates_with_order_four():
     x0 = {"x": 0.0, "l": 4.0, "theta": 1.0, "dx": 0.0, "dl": 0.0, "dtheta": 0.0}
     ends = [
-        sv.close(
-            sv.plant(RELATIVE), lambda t, y: [0.0, -981.0], x0, (0.0, 2.0), timing=sv.Timing(rate=10.0, substeps=n)
-        ).states[:, -1]
+        sv.close(sv.plant(RELATIVE), lambda t, y: [0.0, -981.0], x0, (0.0, 2.0), timing=sv.Timing(rate=10.0, substeps=n)).states[:, -1]
         for n in (4, 8, 16, 128)
     ]
     errors = [np.abs(end - ends[-1]).max() for end in ends[:-1]]

@@ -252,9 +252,7 @@ def test_residuals_of_one_level_and_of_high_levels():
 
 def test_a_given_axes_is_used(run):
     ax = Figure().subplots()
-    assert (
-        figures.residuals(run, ax=ax) is ax and figures.path(run, ax=ax) is ax and figures.actuation(run, ax=ax) is ax
-    )
+    assert figures.residuals(run, ax=ax) is ax and figures.path(run, ax=ax) is ax and figures.actuation(run, ax=ax) is ax
 
 
 # --- early ends

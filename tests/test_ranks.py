@@ -52,9 +52,7 @@ def test_rank_margins_are_reported():
 
 
 @pytest.mark.skipif(not EXTENDED, reason="without extended precision the noise is that of double precision")
-@pytest.mark.parametrize(
-    "pivot, rank, clear", [(5e-15, 1, True), (5e-13, 1, False), (5e-11, 1, False), (5e-10, 2, True)]
-)
+@pytest.mark.parametrize("pivot, rank, clear", [(5e-15, 1, True), (5e-13, 1, False), (5e-11, 1, False), (5e-10, 2, True)])
 def test_a_pivot_is_rounding_undecided_or_resolved(pivot, rank, clear):
     """Below 1e-14 it is the rounding of constants folded in double; above 1e-10 a division by it leaves six digits."""
     for rows, columns in ((1.0, 1.0), (1e6, 1e-9)):
@@ -211,9 +209,8 @@ def test_identities_are_decided_where_values_cannot_tell(monkeypatch):
     assert tests == []  # no entry is zero at the points
     solved(ca.vertcat(ca.horzcat(a, late, c), ca.horzcat(b, d, a), ca.horzcat(c, a, d)))
     assert tests == [1]  # the entry is asked about, and stays: it is alive at t = 9
-    solved(
-        ca.vertcat(ca.horzcat(a, (a + b) ** 2 - a * a - 2 * a * b - b * b, c), ca.horzcat(b, d, a), ca.horzcat(c, a, d))
-    )
+    solved(ca.vertcat(ca.horzcat(a, (a + b) ** 2 - a * a - 2 * a * b - b * b, c), ca.horzcat(b, d, a),
+                      ca.horzcat(c, a, d)))
     assert tests == [1, 1]  # nothing is left of it
     solved(ca.vertcat(ca.horzcat(a, a * b, c), ca.horzcat(c, b * c + late, d), ca.horzcat(d, b, a)))
     assert tests[2] == 1 and len(tests) <= 4  # a difference that arises on the way, then those that follow

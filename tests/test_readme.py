@@ -50,11 +50,7 @@ def listed(values):
 def settled(text):
     """A printed report without what depends on rounding or on how functions are compiled."""
     text = re.sub(r"\d\.\de[+-]\d+", "#", text)
-    return [
-        line
-        for line in text.splitlines()
-        if not re.match(r"  (operations|watched|nfev|iterations|.*largest residual)", line)
-    ]
+    return [line for line in text.splitlines() if not re.match(r"  (operations|watched|nfev|iterations|.*largest residual)", line)]
 
 
 @pages

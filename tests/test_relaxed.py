@@ -305,7 +305,9 @@ def furuta():
     )
     speed = ca.jacobian(bob, q.jet(0)) @ q.jet(1)
     kinetic = p.J * q.d(1)[0] ** 2 / 2 + p.m * ca.dot(speed, speed) / 2
-    mechanism = sv.Mechanism(q, kinetic=kinetic, potential=p.m * p.g * bob[2], parameters=p, actuators={"torque": phi})
+    mechanism = sv.Mechanism(
+        q, kinetic=kinetic, potential=p.m * p.g * bob[2], parameters=p, actuators={"torque": phi}
+    )
     program = sv.Program({"phi": phi - rest_to_rest(q.t, 0.0, np.pi / 2, 1.0, t_start=1.0)})
     return mechanism, program, (0.0, 3.0), 1e-4, np.pi / 2
 
@@ -497,9 +499,7 @@ def test_control_points_give_lines_and_integrals_are_exact():
     assert points @ mesh.of_inputs(mesh.nodes) == pytest.approx(3.0 * mesh.nodes[None], abs=1e-13)
     assert mesh.weights @ mesh.nodes**8 == pytest.approx(2.0**9 / 9, rel=1e-14)
     powers = mesh.power_coefficients(points)[:, 1, 0]
-    assert np.polyval(powers[::-1], 0.25) == pytest.approx(
-        (points @ mesh.of_inputs(np.array([0.5 + 1.5 * 0.625])))[0, 0]
-    )
+    assert np.polyval(powers[::-1], 0.25) == pytest.approx((points @ mesh.of_inputs(np.array([0.5 + 1.5 * 0.625])))[0, 0])
 
 
 def test_weights_fall_by_the_factor_from_the_first_to_the_last(monkeypatch, crane):

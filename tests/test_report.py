@@ -49,10 +49,7 @@ DRIFTING = (
 # - ball on a turntable: the circle at 2/7 of the table's rate; the rest drifts, as wheels of a satellite do.
 FLAT += ("slung-load", "slung-load-3d", "flexible-joint", "four-bar", "six-axis-arm")
 RESTING |= {
-    "double-pendulum": (
-        "marginal",
-        np.sqrt((2 + np.array([1, 1, -1, -1]) * np.sqrt(2)) * 9.81 / 0.8) * [1j, -1j, 1j, -1j],
-    ),
+    "double-pendulum": ("marginal", np.sqrt((2 + np.array([1, 1, -1, -1]) * np.sqrt(2)) * 9.81 / 0.8) * [1j, -1j, 1j, -1j]),
     "elastic-link": ("minimum phase", gallery_numbers.link_poles()),
 }
 FLAT += ("rotary-crane", "beam-crane")
@@ -375,9 +372,7 @@ def test_weak_directions_act_above_1e_7(alpha, idle):
 def test_directions_without_effect_are_named(gallery_model):
     model = gallery_model("crane-3d")
     found = sv.report(model, scene_start("crane-3d", model)).directions
-    assert found.cosines == pytest.approx(
-        [1.0, 0.0, 0.0], abs=1e-12
-    )  # the hoist lifts; a hanging load does not move aside
+    assert found.cosines == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)  # the hoist lifts; a hanging load does not move aside
     assert found.actuators == ("bridge", "trolley") and found.residuals == ("X", "Y")
 
 

@@ -12,9 +12,7 @@ import servoctl as sv
 
 HOME = {"pan": 0.3, "lift": 0.2, "elbow": 1.4, "roll": 0.2, "bend": 0.9, "turn": 0.4}
 LEGS = ("front_left", "front_right", "hind_left", "hind_right")
-STANDING = {"base_z": 0.3} | {
-    f"{leg}_{joint}": angle for leg in LEGS for joint, angle in (("flexion", 0.7), ("knee", -1.4))
-}
+STANDING = {"base_z": 0.3} | {f"{leg}_{joint}": angle for leg in LEGS for joint, angle in (("flexion", 0.7), ("knee", -1.4))}
 
 
 def place(robot, link, posture):
@@ -145,10 +143,7 @@ ROD = (
 def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
     """Two cranks move the point where two chains meet: along a line, by the motors at the ground alone."""
     path = tmp_path / "five_bar.urdf"
-    path.write_text(
-        FIVE_BAR.format(sides="".join(SIDE.format(s=s, x=x, rod=ROD) for s, x in (("left", -0.1), ("right", 0.1)))),
-        encoding="utf-8",
-    )
+    path.write_text(FIVE_BAR.format(sides="".join(SIDE.format(s=s, x=x, rod=ROD) for s, x in (("left", -0.1), ("right", 0.1)))), encoding="utf-8")
     robot = sv.urdf(path)
     ends = robot.frame("left_end"), robot.frame("right_end")
     mechanism = robot.mechanism(sv.loop(*ends, "position"), actuators=("left_motor", "right_motor"))
@@ -242,9 +237,7 @@ def test_energy_and_momentum_are_those_of_the_mechanism():
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, (x, ca.sin(y))), potential=3 * x)
     dx, dy = q.d(1)
-    assert value(
-        sv.programs.energy("e", mechanism, 1.0)["e"] - (dx**2 + (ca.cos(y) * dy) ** 2 + 3 * x - 1)
-    ) == pytest.approx(0)
+    assert value(sv.programs.energy("e", mechanism, 1.0)["e"] - (dx**2 + (ca.cos(y) * dy) ** 2 + 3 * x - 1)) == pytest.approx(0)
     assert value(sv.programs.momentum("p", mechanism, "y", x)["p"] - (2 * ca.cos(y) ** 2 * dy - x)) == pytest.approx(0)
 
 
@@ -281,10 +274,7 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
         (lambda q: sv.programs.constant_speed("p", q, (q["x"],), ca.DM(0.0)), "0"),
         (lambda q: sv.programs.jerk_norm("p", q, (q["x"],), ca.SX(2.0) - 3.0), "-1"),
         (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), 2.0 * np.eye(3)), "no rotation"),
-        (
-            lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), np.diag([1, 1, -1])),
-            "no rotation",
-        ),
+        (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), np.diag([1, 1, -1])), "no rotation"),
         (lambda q: sv.rotations.turn(q["x"], (0, 0, 1), np.zeros((3, 3))), "no rotation"),
         (lambda q: sv.rotations.spline(q.t, [], []), "rotation"),
         (lambda q: sv.programs.follow_point("p", (q["x"], q["y"]), (1,)), "2 entries with 1"),
@@ -342,11 +332,7 @@ def test_rotations_refuse_half_turns_and_what_is_none():
         sv.rotations.turn(0.5, (0, 0, 0))
 
 
-TWO_LEGS = {
-    f"{leg}_{joint}": angle
-    for leg in ("front", "hind")
-    for joint, angle in (("hip", 0.7), ("knee", -1.4), ("ankle", 0.7))
-}
+TWO_LEGS = {f"{leg}_{joint}": angle for leg in ("front", "hind") for joint, angle in (("hip", 0.7), ("knee", -1.4), ("ankle", 0.7))}
 
 
 def test_rows_of_two_soles_are_those_of_their_plane():

@@ -79,9 +79,7 @@ def test_spirals_end_at_one_radian(order, method):
 def test_spirals_by_series_of_which_every_third_coefficient_is_zero(terms):
     order = 4
     model, start = spiral_start(order)
-    run = sv.simulate(
-        model, start, (0.0, 2.0), method=sv.methods.Taylor(order=terms, **TIGHT), t_eval=np.linspace(0, 2, 9)
-    )
+    run = sv.simulate(model, start, (0.0, 2.0), method=sv.methods.Taylor(order=terms, **TIGHT), t_eval=np.linspace(0, 2, 9))
     reference = cf.spiral(run.t, order)
     assert max(np.max(np.abs(run[name] - reference[name])) for name in ("x", "y", "dx", "dy")) < 1e-9
 

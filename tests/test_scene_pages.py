@@ -25,10 +25,7 @@ def told(page):
 @pytest.mark.parametrize("name", gallery)
 def test_the_page_of_a_scene_is_what_its_code_says_and_prints(name):
     written, _ = WRITER["scene_page"](name)
-    (words, numbers), (shown, stored) = (
-        told(written),
-        told((DOCS / "gallery" / f"{name}.md").read_text(encoding="utf-8")),
-    )
+    (words, numbers), (shown, stored) = told(written), told((DOCS / "gallery" / f"{name}.md").read_text(encoding="utf-8"))
     assert words == shown
     for found, expected in zip(numbers, stored, strict=True):
         assert found == pytest.approx(expected, rel=1e-3, abs=1e-3 * max(abs(expected), default=0.0))
@@ -54,8 +51,5 @@ def test_a_scene_is_drawn_again(tmp_path):
 
 
 def test_facts_tell_programs_from_material_constraints():
-    rows = {
-        name: (DOCS / "gallery" / f"{name}.md").read_text(encoding="utf-8").split("---|\n")[1].split("\n")[0]
-        for name in gallery
-    }
+    rows = {name: (DOCS / "gallery" / f"{name}.md").read_text(encoding="utf-8").split("---|\n")[1].split("\n")[0] for name in gallery}
     assert rows["crane-3d-redundant"] == "| 0, 0, 0 + 0 | 2 | 5 | 0 |" and rows["spiral"] == "| 3 | 0 | - | 5 |"

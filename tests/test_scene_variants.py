@@ -230,9 +230,7 @@ def test_the_six_axis_arm_is_the_one_of_the_examples():
     found = []
     for arm in (here, there):
         q = arm.q
-        expressions = ca.vertcat(
-            arm.mechanism().balance, arm.frame("tool").position, ca.vec(arm.frame("tool").rotation)
-        )
+        expressions = ca.vertcat(arm.mechanism().balance, arm.frame("tool").position, ca.vec(arm.frame("tool").rotation))
         found.append(ca.Function("f", [q.jet(0), q.jet(1), q.jet(2)], [expressions])(*values).full().ravel())
     assert found[0] == pytest.approx(found[1], abs=1e-12)
     assert here.effort == there.effort and here.damping == there.damping

@@ -139,13 +139,7 @@ def test_a_force_that_ends_at_a_parameter():
         assert np.abs(s["dx", "T"][~after][:-1]).max() < 1e-9
 
 
-SAMPLES = {
-    "late": [1.0, 2.0, 3.0],
-    "between": [0.7, 1.31, 2.0],
-    "one": [2.5],
-    "the first alone": [0.0],
-    "the end": [3.0],
-}
+SAMPLES = {"late": [1.0, 2.0, 3.0], "between": [0.7, 1.31, 2.0], "one": [2.5], "the first alone": [0.0], "the end": [3.0]}
 
 
 @pytest.mark.parametrize("times", SAMPLES.values(), ids=SAMPLES)
@@ -291,13 +285,7 @@ def test_a_bounded_motion_has_no_free_initial_values():
         sv.sensitivity(run, to="q2")
 
 
-BOUNDED_SAMPLES = {
-    "between": [0.5, 1.0, 1.5],
-    "one": [1.0],
-    "late": [1.7, 2.0],
-    "ends": [0.0, 2.0],
-    "start": [0.0, 0.3],
-}
+BOUNDED_SAMPLES = {"between": [0.5, 1.0, 1.5], "one": [1.0], "late": [1.7, 2.0], "ends": [0.0, 2.0], "start": [0.0, 0.3]}
 
 
 @pytest.mark.parametrize("times", BOUNDED_SAMPLES.values(), ids=BOUNDED_SAMPLES)

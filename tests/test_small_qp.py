@@ -20,13 +20,9 @@ pytestmark = pytest.mark.skipif(compiler.compiler() is None, reason="needs a com
 
 def in_c(n, m):
     sizes = {"N_QP": n, "M_QP": m, "QP_STEPS": STEPS, "QP_MET": WITHIN, "QP_DEPENDENT": DEPENDENT, "NAME": "qp"}
-    text = (
-        emit.unit(sizes)
-        + emit.include("small_qp.h")
-        + (
-            "int solve(const double *H, const double *N, const double *b, double *v)\n"
-            "{ return small_qp((const double (*)[N_QP])H, (const double (*)[N_QP])N, b, v); }\n"
-        )
+    text = emit.unit(sizes) + emit.include("small_qp.h") + (
+        "int solve(const double *H, const double *N, const double *b, double *v)\n"
+        "{ return small_qp((const double (*)[N_QP])H, (const double (*)[N_QP])N, b, v); }\n"
     )
     library = compiler.library(text)
 

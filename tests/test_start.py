@@ -188,10 +188,7 @@ def test_a_program_rests_where_its_residual_does_to_first_order(begins, rests):
     x, theta = q
     load = ca.vertcat(x + ca.sin(theta), -ca.cos(theta))
     crane = sv.Mechanism(
-        q,
-        gibbs=sv.particle(q, 10.0, x) + sv.particle(q, 100.0, load),
-        potential=981.0 * load[1],
-        actuators={"trolley": x},
+        q, gibbs=sv.particle(q, 10.0, x) + sv.particle(q, 100.0, load), potential=981.0 * load[1], actuators={"trolley": x}
     )
     start = sv.derive(crane, sv.Program({"path": begins(q, x)})).start(guess={"theta": 0.3})
     assert start["theta"] == pytest.approx(0.0 if rests else 0.3, abs=1e-12)
@@ -393,9 +390,7 @@ def turning_back(q):
 @pytest.mark.parametrize("along", ["line", "cusp", "velocity", "turning"])
 def test_a_car_that_turns_back_is_told_to_stand_still_there(along):
     model = pushed_car(lambda q: turning_back(q)[along])
-    with refused(
-        sv.errors.SingularProgram, "stands still", "psi", "skid", rows=["skid"], coordinates=("psi",)
-    ) as caught:
+    with refused(sv.errors.SingularProgram, "stands still", "psi", "skid", rows=["skid"], coordinates=("psi",)) as caught:
         sv.simulate(model, model.start(guess={"dx": 1.0}), (0.0, 2.0))
     assert caught.value.details["t"] == pytest.approx(1.0, abs=1e-9)
     assert caught.value.details["nearest_time"] == pytest.approx(1.001)
@@ -404,9 +399,7 @@ def test_a_car_that_turns_back_is_told_to_stand_still_there(along):
 
 def test_a_car_at_rest_whose_speed_is_free_is_told_to_start_in_motion():
     model = pushed_car(lambda q: {"across": q.dt(q["y"] - 0.3)})
-    with refused(
-        sv.errors.SingularProgram, "stands still", "psi", "model.start(dx=", rows=["skid"], nearest_time=None
-    ) as caught:
+    with refused(sv.errors.SingularProgram, "stands still", "psi", "model.start(dx=", rows=["skid"], nearest_time=None) as caught:
         sv.simulate(model, model.start(), (0.0, 2.0))
     assert caught.value.details["rates"] == ("dx",)
 
@@ -570,9 +563,7 @@ def test_a_hidden_constraint_that_divides_by_zero_is_refused_with_its_divisor(na
     """v tan δ = ψ' says nothing of v on a straight line, and the program of ψ and v leaves no other equation for it."""
     build, t, changes = UNDIVIDED[name]
     model = sv.derive(*build())
-    with refused(
-        sv.errors.SingularProgram, "divides by", "q.dt(heading, 1)", rows=["speed"], residuals=["heading"]
-    ) as caught:
+    with refused(sv.errors.SingularProgram, "divides by", "q.dt(heading, 1)", rows=["speed"], residuals=["heading"]) as caught:
         model.start(t)
     later = caught.value.details["nearest_time"]
     assert (later is not None) == changes

@@ -266,9 +266,7 @@ def derives_again(patch):
 def test_rows_derived_again_lead_on(make, method, derived, monkeypatch):
     derives_again(monkeypatch)
     model = derived(on_a_circle, make)
-    run = sv.simulate(
-        model, model.start(x=1.0, y=0.0, dx=0.0, dy=1.0), (0.0, 20.0), as_method(method, **precise(method))
-    )
+    run = sv.simulate(model, model.start(x=1.0, y=0.0, dx=0.0, dy=1.0), (0.0, 20.0), as_method(method, **precise(method)))
     assert run.success and run.counters["pivot_changes"] >= 6
     assert np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max() < 1e-8
 
@@ -278,9 +276,7 @@ def test_long_steps_change_pivots_on_the_way_back_too(derived, monkeypatch):
     model = derived(on_a_circle, "equation")
     x, y = np.cos(20.0), np.sin(20.0)
     start = model.start(t=20.0, x=x, y=y, dx=-y, dy=x)
-    run = sv.simulate(
-        model, start, (20.0, 0.0), method=sv.methods.Taylor(order=20, rtol=1e-11, atol=1e-13), drift="project"
-    )
+    run = sv.simulate(model, start, (20.0, 0.0), method=sv.methods.Taylor(order=20, rtol=1e-11, atol=1e-13), drift="project")
     assert run.success and run.counters["steps"] < 30 and run.counters["pivot_changes"] >= 6
     assert np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max() < 1e-9
 

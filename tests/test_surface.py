@@ -242,9 +242,7 @@ def test_a_large_specification_prints_in_eight_lines():
         assert short(value)
 
 
-@pytest.mark.parametrize(
-    "value", [sv.methods.Project(), sv.methods.Poles(0.1), sv.methods.Poles({"X": (-1.0, -2.0)}), gallery["vtol"]]
-)
+@pytest.mark.parametrize("value", [sv.methods.Project(), sv.methods.Poles(0.1), sv.methods.Poles({"X": (-1.0, -2.0)}), gallery["vtol"]])
 def test_small_values_print_in_eight_lines(value):
     assert short(value)
     assert short(str(value))
@@ -333,9 +331,7 @@ run = sv.simulate(model, model.start(guess=scene.guess), scene.t_span)
 run["trolley"]
 print(model)
 """
-    laws = [
-        module_name(path) for path in FILES if layer(path) in ("control", "study", "inversion", "figures", "interop")
-    ]
+    laws = [module_name(path) for path in FILES if layer(path) in ("control", "study", "inversion", "figures", "interop")]
     kept = {"SERVOCTL_MEMO": "", "SERVOCTL_CACHE": str(tmp_path)}
     assert loaded(script, (*LATE, *SWEEPS, *laws), **kept) == []  # derives
     unused = "numpy.ma", "subprocess", "tempfile", "difflib", "fractions", "zipfile", "importlib.resources"
@@ -450,17 +446,10 @@ def test_every_room_is_in_the_documents():
 
 
 def test_nothing_is_left_open():
-    assert (
-        offenders(
-            lambda path: re.findall(r"\b(?:TODO|FIXME|XXX|NotImplementedError)\b", path.read_text(encoding="utf-8"))
-        )
-        == {}
-    )
+    assert offenders(lambda path: re.findall(r"\b(?:TODO|FIXME|XXX|NotImplementedError)\b", path.read_text(encoding="utf-8"))) == {}
 
 
 def test_the_linter_finds_nothing():
     needs("ruff")
-    found = subprocess.run(
-        [sys.executable, "-m", "ruff", "check", Path(__file__).parent.parent], capture_output=True, text=True
-    )
+    found = subprocess.run([sys.executable, "-m", "ruff", "check", Path(__file__).parent.parent], capture_output=True, text=True)
     assert found.returncode == 0, found.stdout + found.stderr

@@ -254,7 +254,6 @@ def test_ctrl_c_returns_what_is_done():
 def test_a_case_that_swallows_ctrl_c_is_not_finished():
     # a shell's background jobs ignore Ctrl-C from the start, and pytest may be one of them
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-
     def swallowing(m):
         try:
             signal.raise_signal(signal.SIGINT) if m == 3 else None
@@ -333,11 +332,7 @@ def test_a_sweep_of_functions_pickles_by_name():
 
 def test_more_cases_than_fit_into_memory_are_refused():
     assert len(sv.grid(m=range(1000), k=range(1000))) == 10**6
-    for make in (
-        lambda: sv.grid(m=range(1001), k=range(1000)),
-        lambda: sv.grid(m=range(10**15)),
-        lambda: sv.monte_carlo(10**6 + 1, seed=1, m=1.0),
-        lambda: sv.monte_carlo(10**30, seed=1, m=1.0),
-    ):
+    for make in (lambda: sv.grid(m=range(1001), k=range(1000)), lambda: sv.grid(m=range(10**15)),
+                 lambda: sv.monte_carlo(10**6 + 1, seed=1, m=1.0), lambda: sv.monte_carlo(10**30, seed=1, m=1.0)):
         with refused(sv.errors.SpecificationError, most=10**6):
             make()

@@ -18,9 +18,7 @@ from servoctl.model.switching import switching
 from servoctl.simulation import simulated
 
 METHODS = ("DOP853", "RK45", "Radau", "LSODA", "Taylor", "RadauIIA", "RK4", "RK8")
-DRIFTS = [
-    (m, d) for m in ("DOP853", "RK4", "RadauIIA", "Taylor") for d in ("project", 0.1) if (m, d) != ("Taylor", 0.1)
-]
+DRIFTS = [(m, d) for m in ("DOP853", "RK4", "RadauIIA", "Taylor") for d in ("project", 0.1) if (m, d) != ("Taylor", 0.1)]
 PAIRS = [*((m, None) for m in METHODS), *DRIFTS]
 EVENTS = {"rtol": 1e-13, "atol": 1e-14, "method": "DOP853", "dense_output": True}
 
@@ -84,7 +82,9 @@ def stop(t):
     """A mass of speed 1 that meets a spring of 400 N/m at y = 0.1."""
     contact, w = 0.1, 20.0
     leaves = contact + np.pi / w
-    return np.where(t < contact, t, np.where(t < leaves, 0.1 + np.sin(w * (t - contact)) / w, 0.1 - (t - leaves)))
+    return np.where(
+        t < contact, t, np.where(t < leaves, 0.1 + np.sin(w * (t - contact)) / w, 0.1 - (t - leaves))
+    )
 
 
 @pytest.mark.parametrize(("method", "drift"), PAIRS)
@@ -198,7 +198,9 @@ def test_what_slides_along_a_switch_is_told_with_an_accuracy_too():
 def test_switches_of_accelerations_are_refused():
     q = sv.coordinates("x y")
     (x, _), (ddx, ddy) = q, q.d(2)
-    mechanism = sv.Mechanism(q, gibbs=(ddx**2 + ddy**2) / 2, actuators={"F": x}, forces={"y": -ca.sign(ddx)})
+    mechanism = sv.Mechanism(
+        q, gibbs=(ddx**2 + ddy**2) / 2, actuators={"F": x}, forces={"y": -ca.sign(ddx)}
+    )
     model = sv.derive(mechanism, sv.Program({"x": x - ca.sin(q.t)}))
     with refused(sv.errors.SpecificationError, "d2x", order=2):
         sv.simulate(model, model.start(), (0.0, 1.0))
@@ -509,7 +511,9 @@ def test_steep_blends_neither_overflow_nor_are_stepped_over(name, method, slope)
     model, start = beside(force=lambda t, y, dy: symbolic(slope * (t - 1)) - y, y=0.3, dy=0.0)
     run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
     cuts = [0.0, *(1 + np.array([-50.0, -5.0, 0.0, 5.0, 50.0]) / slope), 2.0]
-    parts = (quad(lambda s: numeric(slope * (s - 1)) * np.sin(2 - s), a, b, epsabs=1e-13)[0] for a, b in pairwise(cuts))
+    parts = (
+        quad(lambda s: numeric(slope * (s - 1)) * np.sin(2 - s), a, b, epsabs=1e-13)[0] for a, b in pairwise(cuts)
+    )
     assert run["y"][-1] == pytest.approx(0.3 * np.cos(2.0) + sum(parts), abs=1e-7)
 
 

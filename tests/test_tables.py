@@ -133,7 +133,9 @@ def test_a_plan_along_100_points_has_the_forces_of_the_spline():
     t = np.linspace(0.0, 6.0, 100)
     via = np.array([np.sin(t), np.cos(2 * t)]).T
     path = sv.paths.spline(q.t, t, via, 3, "natural")
-    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, ca.vertcat(x, y)), actuators={"Fx": x, "Fy": y}, parameters=p)
+    mechanism = sv.Mechanism(
+        q, gibbs=sv.particle(q, p.m, ca.vertcat(x, y)), actuators={"Fx": x, "Fy": y}, parameters=p
+    )
     model = sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}, by="actuators"))
     run = sv.simulate(model, model.start(), t_span=(0.0, 6.0), t_eval=np.linspace(0.0, 6.0, 3001))
     zeros = [(order, np.zeros(2)) for order in (3, 4)]
@@ -145,9 +147,7 @@ def test_a_plan_along_100_points_has_the_forces_of_the_spline():
 
 def test_series_by_pieces_are_those_of_the_sums():
     inside = sv.paths.spline(T, UNEVEN, points(UNEVEN), ends="natural")
-    path = ca.vertcat(
-        inside, ca.sin(inside[0]) * (T >= UNEVEN[3]), sum(float(k) * (T >= k) for k in range(9)), ca.exp(-T)
-    )
+    path = ca.vertcat(inside, ca.sin(inside[0]) * (T >= UNEVEN[3]), sum(float(k) * (T >= k) for k in range(9)), ca.exp(-T))
     tape = Tape([T], path.elements())
     short = copy(tape)
     short.nodes = by_pieces(tape, (a for a, _ in tape.switches))
@@ -183,11 +183,7 @@ def test_an_exported_plan_has_the_tables(real, tmp_path, c_compiler):
     for t, force in zip(run.t, run["F"], strict=True):
         assert step(number(t), *(a.ctypes.data_as(ctypes.c_void_p) for a in (x, parameters, z, u))) >= 0
         assert abs(u[0] - force) < (1e-10 if real == "double" else 1e-3) * np.abs(run["F"]).max()
-    assert (
-        source.read_text(encoding="utf-8").count("static double row(")
-        + source.read_text(encoding="utf-8").count("static float row(")
-        == 1
-    )
+    assert source.read_text(encoding="utf-8").count("static double row(") + source.read_text(encoding="utf-8").count("static float row(") == 1
 
 
 # tables of data --------------------------------------------------------------------------------------------------------
@@ -241,9 +237,7 @@ def test_tables_of_data_equal_the_sums_at_and_between_knots(uncontracted, monkey
     x, values = np.array([t[::-1], np.cos(np.arange(t.size))]), []
     for path in in_both_forms(monkeypatch, build):
         slopes = ca.vec(ca.jacobian(path, ca.vertcat(T, X)))
-        f = ca.Function(
-            "f", [T, X, P], [ca.densify(ca.vertcat(path, slopes, ca.jtimes(ca.jtimes(path, T, 1.0), T, 1.0)))]
-        )
+        f = ca.Function("f", [T, X, P], [ca.densify(ca.vertcat(path, slopes, ca.jtimes(ca.jtimes(path, T, 1.0), T, 1.0)))])
         model = compiled(f, "f")
         alone = np.hstack([model.grid(t[k : k + 7], x[:, k : k + 7], [1.5]) for k in range(0, t.size, 7)])
         by_casadi = np.array([np.asarray(f(*row)).ravel() for row in zip(t, x.T, np.full(t.size, 1.5), strict=True)]).T
@@ -257,9 +251,7 @@ def test_tables_of_data_equal_the_sums_at_and_between_knots(uncontracted, monkey
 def test_motions_on_tables_of_data_are_those_on_sums(monkeypatch, method):
     def motion():
         model = pendulum_cart(MOVING[method])
-        return sv.simulate(
-            model, model.start(theta=0.1, dtheta=0.0), method=method, t_span=(0.0, EVEN[19]), t_eval=EVEN[:20]
-        )
+        return sv.simulate(model, model.start(theta=0.1, dtheta=0.0), method=method, t_span=(0.0, EVEN[19]), t_eval=EVEN[:20])
 
     sums, data = in_both_forms(monkeypatch, motion)
     assert data.method == sums.method
@@ -274,11 +266,7 @@ def test_series_end_where_a_time_law_reaches_the_knots_of_a_table(monkeypatch):
     knots = np.linspace(0.0, 1.0, 12)[1:-1]
     first = np.arcsin((knots[np.abs(knots - 0.5) < 0.4] - 0.5) / 0.4)
     expected = np.sort([*(first % (2 * np.pi)), *(np.pi - first)])
-    np.testing.assert_allclose(
-        model.reduction.switches.ends_of_pieces(model.parameters, (0.0, 2 * np.pi)),
-        expected[expected <= 2 * np.pi],
-        atol=1e-13,
-    )
+    np.testing.assert_allclose(model.reduction.switches.ends_of_pieces(model.parameters, (0.0, 2 * np.pi)), expected[expected <= 2 * np.pi], atol=1e-13)
 
 
 @pytest.mark.parametrize("law", [lambda t: t, lambda t: sv.paths.rest_to_rest(t, 0.0, 6.0, 6.0, 6)])
@@ -365,6 +353,7 @@ def test_steps_end_at_knots_without_a_call_for_each(monkeypatch, c_compiler):
     assert np.isin(knots[1:], np.concatenate(ends)).all()
     assert len(ends) <= 1 + run.counters["steps"] // TaylorSteps.most
     assert sv.verify(run).passed
+
 
 
 def test_an_exported_plan_holds_its_tables_of_data(monkeypatch, tmp_path, c_compiler):

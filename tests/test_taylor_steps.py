@@ -371,9 +371,7 @@ def test_a_robot_that_turns_at_measured_rates_has_their_integral(samples, span, 
     model = sv.derive(sv.Mechanism(q, gibbs=S, constraints=wheel), sv.Program(program, by="ideal"))
     start = model.start(t=span[0], x=0.0, y=0.0, theta=0.1)
     t_eval = np.unique(np.concatenate([np.linspace(*sorted(span), 41), times[(times > 0.3) & (times < 5.9)]]))
-    run = sv.simulate(
-        model, start, span, sv.methods.Taylor(rtol=1e-10), t_eval=t_eval[:: 1 if span[0] < span[1] else -1]
-    )
+    run = sv.simulate(model, start, span, sv.methods.Taylor(rtol=1e-10), t_eval=t_eval[:: 1 if span[0] < span[1] else -1])
     curve = make_interp_spline(times, rates[:, None], k=5, bc_type=([(3, [0.0]), (4, [0.0])],) * 2)
     angle = curve.antiderivative()
     heading = 0.1 + angle(run.t)[:, 0] - angle(span[0])[0]

@@ -13,9 +13,7 @@ def exists(name):
     """Whether a name is that of a file, or of a function of one."""
     file, _, function = name.partition("::")
     path = TESTS / file
-    return path.exists() and bool(
-        re.search(rf"^def {function}\(", path.read_text(encoding="utf-8"), re.M) if function else True
-    )
+    return path.exists() and bool(re.search(rf"^def {function}\(", path.read_text(encoding="utf-8"), re.M) if function else True)
 
 
 def test_the_lists_name_files_and_functions_that_exist():

@@ -129,9 +129,7 @@ def test_a_full_circle_is_followed():
     program = sv.Program({"X": x - ca.cos(turn), "Y": y - ca.sin(turn)})
     law = sv.fastest(mechanism, program, {"fx": 3.0, "fy": 3.0}, (0.0, 2.0), shape=True)
     assert np.abs(np.hypot(law.plan["x"], law.plan["y"]) - 1.0).max() < 1e-11
-    assert (
-        max(np.abs(law.plan[name]).max() for name in ("fx", "fy")) <= 3.0 and active(law, {"fx": 3.0, "fy": 3.0}) > 0.8
-    )
+    assert max(np.abs(law.plan[name]).max() for name in ("fx", "fy")) <= 3.0 and active(law, {"fx": 3.0, "fy": 3.0}) > 0.8
     assert sv.verify(law.plan).passed
 
 
@@ -159,12 +157,7 @@ def test_what_is_no_curve_is_refused():
         sv.fastest(windy, pushed[1], wanted, (0.0, 2.0), shape=True)
     with refused(sv.errors.SpecificationError, name="speed"):
         sv.fastest(
-            *wheeled_robot(),
-            {"steer": 0.5},
-            (0.0, 5.0),
-            start=gallery["wheeled-robot"].start,
-            guess={"v": 1.0},
-            shape=True,
+            *wheeled_robot(), {"steer": 0.5}, (0.0, 5.0), start=gallery["wheeled-robot"].start, guess={"v": 1.0}, shape=True
         )
     with refused(sv.errors.SpecificationError, "str", name="shape"):
         sv.fastest(*pushed, wanted, (0.0, 2.0), shape="yes")

@@ -93,9 +93,7 @@ def test_errors_between_the_steps_count(scene):
         best = study.recommend(error=error)
         run = sv.simulate(*scene, (0.0, 2.0), **best)
         dense = np.random.default_rng(3).uniform(0.0, 2.0, 1500)
-        exact = sv.simulate(
-            *scene, (0.0, 2.0), sv.methods.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=np.sort(dense)
-        )
+        exact = sv.simulate(*scene, (0.0, 2.0), sv.methods.Taylor(rtol=1e-15, atol=1e-15), drift="project", t_eval=np.sort(dense))
         jets = np.array([run.at(t) for t in exact.t]).T
         assert motion_error(scene[0], jets, exact.jets) <= 1.5 * error
 
@@ -253,22 +251,12 @@ def test_the_plot_draws_every_number(cost, study):
     drawn = [line for line in ax.lines if line.get_marker() not in ("None", "", None)]
     assert sum(len(line.get_xdata()) for line in drawn) == np.isfinite(study["error"]).sum()
     assert ax.get_xscale() == ax.get_yscale() == "log" and cost in ax.get_xlabel() and ax.get_title() == "trade"
-    keys = {
-        key.get_text(): line.get_color()
-        for key, line in zip(ax.get_legend().get_texts(), ax.get_legend().get_lines(), strict=True)
-    }
+    keys = {key.get_text(): line.get_color() for key, line in zip(ax.get_legend().get_texts(), ax.get_legend().get_lines(), strict=True)}
     assert {"projected", "poles at -1/(0.05 s)", "Pareto front"} <= set(keys)
     best = set(study.pareto(cost)["method"].tolist())
     (others,) = [text for text in keys if text.startswith("never best: ")]
-    assert {method for method in ("Taylor", "DOP853", "RK4", "LSODA") if method in keys} == best & {
-        "Taylor",
-        "DOP853",
-        "RK4",
-        "LSODA",
-    }
-    assert (
-        set(others.removeprefix("never best: ").replace("\n", " ").split(", ")) == set(study["method"].tolist()) - best
-    )
+    assert {method for method in ("Taylor", "DOP853", "RK4", "LSODA") if method in keys} == best & {"Taylor", "DOP853", "RK4", "LSODA"}
+    assert set(others.removeprefix("never best: ").replace("\n", " ").split(", ")) == set(study["method"].tolist()) - best
     grey = sum(len(line.get_xdata()) for line in drawn if line.get_color() == keys[others])
     reaching = set(zip(study.pareto(cost)["method"].tolist(), study.pareto(cost)["drift"].tolist(), strict=True))
     rows = zip(study["method"].tolist(), study["drift"].tolist(), np.isfinite(study["error"]).tolist(), strict=True)

@@ -148,7 +148,6 @@ def test_parts_plants_and_loops_keep_units(plan, loop, tmp_path):
 
 def test_a_derivation_on_disk_serves_the_units_of_its_reader():
     """The same equations with other units: what is read back has those of the mechanism that is derived."""
-
     def moved(units):
         q = sv.coordinates("x", units=units)
         mechanism = sv.Mechanism(q, sv.particle(q, 1.0, *q), actuators={"force": q["x"]})
@@ -175,9 +174,7 @@ def test_axes_have_units(plan):
 
 
 def test_printed_values_have_units(plan, loop):
-    shown = {
-        name: line for line in repr(plan).splitlines() for name in ("trolley", "X") if line.startswith(f"  {name}:")
-    }
+    shown = {name: line for line in repr(plan).splitlines() for name in ("trolley", "X") if line.startswith(f"  {name}:")}
     assert "  trolley: 0 N .. " in shown["trolley"] and " N (t = " in shown["trolley"] and " m (t = " in shown["X"]
     assert " N; limited during " in next(line for line in repr(loop).splitlines() if line.startswith("  trolley: "))
 
@@ -197,9 +194,7 @@ def test_headers_in_c_have_units(plan, loop, tmp_path):
 def table(request):
     if request.param != "study":
         return request.getfixturevalue(request.param)
-    return sv.types.Study(
-        "many", {"x": [1.0, 2.0], "trolley_max": [3.0, np.nan], "error": ["", "=1"]}, {"units": CRANE_UNITS}
-    )
+    return sv.types.Study("many", {"x": [1.0, 2.0], "trolley_max": [3.0, np.nan], "error": ["", "=1"]}, {"units": CRANE_UNITS})
 
 
 def test_tables_have_the_same_columns_and_units(table, tmp_path):

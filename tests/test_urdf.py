@@ -55,7 +55,7 @@ def test_forces_and_mass_matrix_equal_pinocchio(name, base):
 def test_frames_and_their_jacobians_equal_pinocchio(name, base):
     arm = robot(name, base)
     other = robots.Pinocchio(arm, robots.file_of(name), base)
-    links, random = arm.links[1 :: max(1, len(arm.links) // 8)], np.random.default_rng(2)
+    links, random = arm.links[1:: max(1, len(arm.links) // 8)], np.random.default_rng(2)
     parts = [part for link in links for part in vars(arm.frame(link)).values() if isinstance(part, ca.SX)]
     evaluate = robots.function_of(arm, *parts)
     for _ in range(5):
@@ -78,12 +78,7 @@ def test_frames_and_their_jacobians_equal_pinocchio(name, base):
 
 def test_a_pendulum_has_its_textbook_balance():
     arm = sv.urdf(bar(inside='<origin xyz="0 0 1"/><axis xyz="0 2 0"/><dynamics damping="0.3"/>'))
-    arm = sv.urdf(
-        bar(
-            INERTIAL.replace("<mass", '<origin xyz="0 0 -0.4"/><mass'),
-            inside='<axis xyz="0 2 0"/><dynamics damping="0.3"/>',
-        )
-    )
+    arm = sv.urdf(bar(INERTIAL.replace("<mass", '<origin xyz="0 0 -0.4"/><mass'), inside='<axis xyz="0 2 0"/><dynamics damping="0.3"/>'))
     mechanism = arm.mechanism()
     q, v, a = 0.7, 1.3, -0.4
     (balance, energy) = robots.function_of(arm, mechanism.balance, mechanism.energy)(q, v, a)
@@ -121,9 +116,7 @@ def test_a_floating_joint_inside_the_tree_is_a_free_body():
     arm = sv.urdf(text)
     frame, q = arm.frame("body"), arm.q
     centre = frame.position + frame.rotation @ ca.DM([0.1, 0.2, 0.0])
-    gibbs = sv.rigid_body(
-        q, 2.0, (1.0, 2.0, 2.5), position=centre, rates=frame.rotation.T @ frame.jacobian[3:, :] @ q.jet(1)
-    )
+    gibbs = sv.rigid_body(q, 2.0, (1.0, 2.0, 2.5), position=centre, rates=frame.rotation.T @ frame.jacobian[3:, :] @ q.jet(1))
     body = sv.Mechanism(q, gibbs=gibbs, potential=2 * 9.81 * centre[2])
     evaluate = robots.function_of(arm, arm.mechanism().balance - body.balance)
     random = np.random.default_rng(3)
@@ -175,9 +168,7 @@ def test_names_become_identifiers_and_keep_apart():
     arm = sv.urdf(bar(more=more).replace('name="hinge"', 'name="8 hinge-a"'))
     assert arm.q.names == ("j_8_hinge_a",)
     assert arm.joints == {"j_8_hinge_a": "8 hinge-a"}
-    two = bar(
-        more=f'<link name="l">{INERTIAL}</link><joint name="dx" type="revolute"><parent link="bar"/><child link="l"/></joint>'
-    )
+    two = bar(more=f'<link name="l">{INERTIAL}</link><joint name="dx" type="revolute"><parent link="bar"/><child link="l"/></joint>')
     assert sv.urdf(two.replace('name="hinge"', 'name="x"')).q.names == ("x", "dx_")
 
 
@@ -206,13 +197,9 @@ def test_symbolic_links_have_the_numbers_of_the_file():
 @pytest.mark.parametrize("encoding", ["utf-8", "iso-8859-1", "utf-16"])
 def test_encodings_that_a_file_declares(tmp_path, encoding):
     path = tmp_path / "bar.urdf"
-    path.write_bytes(
-        (f'<?xml version="1.0" encoding="{encoding}"?>' + bar().replace('"bar"', '"größe"')).encode(encoding)
-    )
+    path.write_bytes((f'<?xml version="1.0" encoding="{encoding}"?>' + bar().replace('"bar"', '"größe"')).encode(encoding))
     assert sv.urdf(path).links == ("ground", "größe")
-    assert (
-        sv.urdf('<?xml version="1.0" encoding="iso-8859-1"?>' + bar().replace('"bar"', '"größe"')).links[1] == "größe"
-    )
+    assert sv.urdf('<?xml version="1.0" encoding="iso-8859-1"?>' + bar().replace('"bar"', '"größe"')).links[1] == "größe"
 
 
 def test_limits_and_damping_reach_the_plant():
@@ -398,9 +385,7 @@ def test_links_whose_names_are_one_identifier_keep_apart():
 def test_a_quaternion_is_that_of_the_base_and_a_unit_one():
     arm = assembled(link("root"), link("b"), joint("arm_qw", "root", "b"), base="free")
     assert dict(zip(arm.q.names, arm.posture({}), strict=True))["arm_qw"] == 0.0
-    with refused(
-        sv.errors.SpecificationError, "base_qz=0.3", "Nearest", length=pytest.approx(np.hypot(1.0, 0.3))
-    ) as caught:
+    with refused(sv.errors.SpecificationError, "base_qz=0.3", "Nearest", length=pytest.approx(np.hypot(1.0, 0.3))) as caught:
         sv.held(arm, ["b"], {"base_qz": 0.3})
     assert caught.value.details["unit"] == pytest.approx(np.array([0, 0, 0.3, 1.0]) / np.hypot(1.0, 0.3))
     assert len(sv.held(arm, ["b"], {"base_qz": 0.6, "base_qw": 0.8})) == 6
@@ -408,9 +393,7 @@ def test_a_quaternion_is_that_of_the_base_and_a_unit_one():
 
 def test_a_joint_and_what_mimics_it_move_mass_together():
     follower = '<axis xyz="0 1 0"/><mimic joint="j" multiplier="-2"/>'
-    driven = assembled(
-        ROOT, link("a", ""), link("b"), joint("j", "root", "a"), joint("f", "root", "b", inside=follower)
-    )
+    driven = assembled(ROOT, link("a", ""), link("b"), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
     assert robots.function_of(driven, driven.mechanism().mass)(0.0, 0.0, 0.0)[0] == pytest.approx(4 * 2.0)
     assembled(ROOT, link("a"), link("b", ""), joint("j", "root", "a"), joint("f", "root", "b", inside=follower))
     with refused(sv.errors.SpecificationError, "j", joint="j"):

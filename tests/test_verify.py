@@ -122,11 +122,7 @@ def dependent(share, by):
     q = sv.coordinates("x y z")
     x, y, z = q
     wave = ca.sin(x) if by == "ideal" else 0.0
-    path = (
-        x - 0.3 * ca.sin(q.t) - 0.2 * wave * z,
-        y - 0.2 * ca.cos(z) - 0.1 * q.t,
-        z - 0.3 * ca.sin(x) + 0.4 * ca.sin(q.t),
-    )
+    path = x - 0.3 * ca.sin(q.t) - 0.2 * wave * z, y - 0.2 * ca.cos(z) - 0.1 * q.t, z - 0.3 * ca.sin(x) + 0.4 * ca.sin(q.t)
     gibbs = ca.sumsqr(ca.vertcat(*q.d(2))) / 2 + sv.particle(q, 0.7, (0.4 * x + ca.sin(y) - 0.3 * z,))
     motors = {} if by == "ideal" else {"actuators": {"u": x, "v": y, "w": y + 0.3 * ca.sin(z)}}
     mechanism = sv.Mechanism(q, gibbs=gibbs, potential=0.8 * x * y + 0.5 * z**2, **motors)
@@ -258,9 +254,7 @@ EDITS = {
 @pytest.mark.parametrize("name", ["overhead-crane", "appell-hamel", "spiral", "vtol-centre"])
 def test_changed_samples_fail(name, edit, gallery_model):
     model, scene = gallery_model(name), gallery[name]
-    run = sv.simulate(
-        model, model.start(**scene.start, guess=scene.guess), scene.t_span, t_eval=np.linspace(*scene.t_span, 201)
-    )
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, t_eval=np.linspace(*scene.t_span, 201))
     for row in range(len(run.jets)) if "times" not in edit and "time" not in edit else [0]:
         k = int(np.argmax(np.abs(run.jets[row])))
         if "time" in edit:
@@ -281,11 +275,7 @@ def test_samples_beside_the_program_are_decided_by_few_steps(monkeypatch):
     monkeypatch.setattr(Compiled, "grid", counted)
     assert sv.verify(run).passed
     least = sum(points)
-    for wrong in (
-        model.with_parameters(k=2.1),
-        model.with_parameters(pace=1.1),
-        chain(path=lambda t: 0.5 * ca.sin(2 * t))[0],
-    ):
+    for wrong in (model.with_parameters(k=2.1), model.with_parameters(pace=1.1), chain(path=lambda t: 0.5 * ca.sin(2 * t))[0]):
         points.clear()
         proof = sv.verify(edited(run, model=wrong))
         assert {"segments", "energy"} <= set(proof.failures) and not proof.doubts
@@ -532,9 +522,7 @@ def test_wrong_forces_at_narrow_peaks_fail(samples):
 @pytest.mark.parametrize("change", [0.0, 1e-13, 1e-10, 1e-7, 3e-6])
 def test_sizes_at_some_instants_give_the_same_verdict(name, change, gallery_model, monkeypatch):
     model, scene = gallery_model(name), gallery[name]
-    run = sv.simulate(
-        model, model.start(**scene.start, guess=scene.guess), scene.t_span, "Taylor" if name == "spiral" else None
-    )
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, "Taylor" if name == "spiral" else None)
     jets = run.jets.copy()
     jets[0, 507] += change * np.abs(jets[0]).max()  # between the instants whose sizes are known
     run = edited(run, jets=jets)

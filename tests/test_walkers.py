@@ -58,9 +58,7 @@ def test_the_accelerations_of_a_robot_are_those_of_its_full_mass_matrix():
     r, q = model.reduction, model.reduction.mechanism.q
     assert model.equations.sparse
     unknown = ca.vertcat(q.jet(2), mu := ca.SX.sym("mu", r.realisation.B.shape[1]))
-    rows = ca.vertcat(
-        r.balance - r.realisation.B @ mu, *(level[-1] for level in row_levels(q, [*r.original.values()], 2))
-    )
+    rows = ca.vertcat(r.balance - r.realisation.B @ mu, *(level[-1] for level in row_levels(q, [*r.original.values()], 2)))
     symbols = [q.t, ca.vertcat(*q, *q.gamma(1)), ca.vertcat(*r.mechanism.parameters.symbols)]
     form = ca.Function("form", symbols, [ca.jacobian(rows, unknown), -ca.substitute(rows, unknown, 0 * unknown)])
     for seed in range(3):

@@ -154,17 +154,13 @@ def write():
     costs = {name: seconds[firsts[name]] for name in cases if name not in skipped}
     first = chosen(costs, {name: (1, arcs.get(name, nothing)) for name in costs}, reached, FIRST)
     share = len(reached) / len(set().union(*arcs.values()))
-    print(
-        f"first tier: {len(first)} functions, {sum(map(costs.get, first)):.0f} s, {share:.1%} of the arcs of all first cases"
-    )
+    print(f"first tier: {len(first)} functions, {sum(map(costs.get, first)):.0f} s, {share:.1%} of the arcs of all first cases")
     rest = {name: [case for case in ids if name not in first or case != firsts[name]] for name, ids in cases.items()}
     costs = {name: sum(map(seconds.get, ids)) for name, ids in rest.items() if ids}
     gains = {name: (len(rest[name]), nothing if name in first else arcs.get(name, nothing)) for name in costs}
     second = chosen(costs, gains, reached, SECOND)
     third = sorted(((costs[name], name) for name in costs if name not in second), reverse=True)
-    print(
-        f"second tier: {sum(map(costs.get, second)):.0f} s; third: {len(third)} functions, {sum(c for c, _ in third):.0f} s"
-    )
+    print(f"second tier: {sum(map(costs.get, second)):.0f} s; third: {len(third)} functions, {sum(c for c, _ in third):.0f} s")
     files = {name.partition("::")[0] for name in cases} - {name.partition("::")[0] for name in first}
     left = files | {name for name in cases if name not in first and name.partition("::")[0] not in files}
     TESTS.joinpath("left.txt").write_text("".join(f"{name}\n" for name in sorted(left)), encoding="utf-8")

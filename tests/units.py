@@ -27,9 +27,7 @@ def in_units(mechanism, program, units, length=1.0, mass=1.0, time=1.0):
     outer = [old.t, *old]
     if not old.plain:
         V = ca.diag(list(of_q.values())) @ old.V @ ca.diag([1 / s for s in of_w.values()])
-        V, h = ca.substitute(
-            [V, ca.diag(list(of_q.values())) @ old.h / time], [ca.vertcat(*outer)], [ca.vertcat(*inner)]
-        )
+        V, h = ca.substitute([V, ca.diag(list(of_q.values())) @ old.h / time], [ca.vertcat(*outer)], [ca.vertcat(*inner)])
         new = new.with_quasi_velocities(" ".join(old.velocity_names), V, h)
     steps = 0 if old.plain else 1  # a rate w is no derivative of a coordinate: its level 1 has its own unit
     for k in range(1, 8):

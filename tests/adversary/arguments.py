@@ -212,11 +212,7 @@ def inverses():
     mechanism, program, plant, closed, free = (s[k] for k in ("mechanism", "program", "plant", "closed", "free"))
     near, slide = s["ideal"].start(y=0.1, dy=0.0), sliding()
     noise = dict.fromkeys(("x", "y", "dx", "dy"), 1e-3)
-    log = {
-        "t": closed.t[:8],
-        **{k: v[:8] for k, v in closed.input.items()},
-        **{k: v[:8] for k, v in closed.measured.items()},
-    }
+    log = {"t": closed.t[:8], **{k: v[:8] for k, v in closed.input.items()}, **{k: v[:8] for k, v in closed.measured.items()}}
     event = sv.Event("y", 0.05)
     return {
         "report": (sv.report, dict(what=sway["run"], limits={"cart": 50.0})),

@@ -169,9 +169,7 @@ class Reference:
             self.multiplier_sizes[m + km : m + km + n] = case.sizes[1]
         self.count = force.numel()
         total = self.balance - reaction - self.Gm.T @ nu
-        nearly = (
-            "nearly dependent" in case.kinds
-        )  # the array is as badly conditioned as such rows, their equivalent is not
+        nearly = "nearly dependent" in case.kinds  # the array is as badly conditioned as such rows, their equivalent is not
         program, orders = (self.plain, self.orders) if nearly else (self.rows, self.orders_given)
         rows = ca.vertcat(self.V @ self.w[0] + self.h, total, *extra, program, self.material)
         levels = [self.q, *self.w[: self.top + 1]]

@@ -222,9 +222,7 @@ def _frame(pick, n):
 
 
 def _potential(pick, n):
-    springs = [
-        f"{pick(1, 20) / 10}*({_variable(pick, n)} - {_decimal(pick)}*{_variable(pick, n)})**2" for _ in range(2)
-    ]
+    springs = [f"{pick(1, 20) / 10}*({_variable(pick, n)} - {_decimal(pick)}*{_variable(pick, n)})**2" for _ in range(2)]
     return " + ".join([*springs, f"{_decimal(pick)}*cos({_variable(pick, n)})"])
 
 

@@ -113,9 +113,7 @@ def outcome(file, old, new, tests, adversary, limit):
     """Apply one bug to a copy of the project and run what should see it."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
-        shutil.copytree(
-            ROOT, copy, ignore=shutil.ignore_patterns(".git", "__pycache__", ".venv", "*.npz", "figures.out")
-        )
+        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", "__pycache__", ".venv", "*.npz", "figures.out"))
         path = copy / "servoctl" / file
         text = path.read_text(encoding="utf-8")
         if text.count(old) != 1:

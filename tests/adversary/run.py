@@ -46,24 +46,14 @@ def main():
     done = _logged(options.log)
     seeds = [seed for seed in range(options.seed, options.seed + options.cases) if seed not in done]
     for seed, case, verdict, seconds in _verdicts(seeds, options.jobs, options.moved):
-        line = {
-            "seed": seed,
-            "outcome": verdict.outcome,
-            "kinds": sorted(set(case.kinds)),
-            "seconds": round(seconds, 2),
-        }
+        line = {"seed": seed, "outcome": verdict.outcome, "kinds": sorted(set(case.kinds)), "seconds": round(seconds, 2)}
         done[seed] = line
         if options.log:
             with options.log.open("a") as file:
                 file.write(json.dumps(line) + "\n")
         if verdict.wrong:
             options.out.mkdir(parents=True, exist_ok=True)
-            content = {
-                "seed": seed,
-                "outcome": verdict.outcome,
-                "detail": verdict.detail,
-                "case": json.loads(case.as_text()),
-            }
+            content = {"seed": seed, "outcome": verdict.outcome, "detail": verdict.detail, "case": json.loads(case.as_text())}
             (options.out / f"{seed}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     counts = table(done.values())
     return 1 if any(outcome.startswith("wrong") for outcome in counts) else 0

@@ -36,9 +36,7 @@ def test_phi_and_theta_rates_return_after_hundreds_of_periods(wheel):
     """The period, from the first crossings of φ' = 0 upwards, still holds at the end."""
     model, start = wheel
     t = np.append(np.linspace(0.0, 20.0, 4001), np.linspace(980.0, 1000.0, 4001))
-    run = sv.simulate(
-        model, start, (0.0, 1000.0), method=sv.methods.Taylor(rtol=1e-14, atol=1e-16), drift="project", t_eval=t
-    )
+    run = sv.simulate(model, start, (0.0, 1000.0), method=sv.methods.Taylor(rtol=1e-14, atol=1e-16), drift="project", t_eval=t)
     crossings = [
         run.t[i] - run["dphi"][i] * (run.t[i + 1] - run.t[i]) / (run["dphi"][i + 1] - run["dphi"][i])
         for i in np.flatnonzero((run["dphi"][:-1] < 0) & (run["dphi"][1:] >= 0))

@@ -19,7 +19,9 @@ LENGTHS = {"a": 1, "b": 1, "rho": 1, "g": 1, "I_x": 2, "I_y": 2}  # of the Appel
 
 
 @pytest.mark.parametrize("unit", UNITS)
-@pytest.mark.parametrize(("method", "drift"), [("DOP853", "project"), ("Taylor", "project"), ("RK4", None)])
+@pytest.mark.parametrize(
+    ("method", "drift"), [("DOP853", "project"), ("Taylor", "project"), ("RK4", None)]
+)
 def test_appell_hamel_in_any_unit(method, drift, unit, gallery_model):
     model = gallery_model("appell-hamel")
     names = model.reduction.mechanism.parameters.names
@@ -210,9 +212,7 @@ def test_a_vehicle_far_from_the_origin_turns_as_at_it(offset, method, gallery_mo
 def test_the_rounding_of_a_coordinate_at_rest_is_no_small_motion():
     levels, sizes = np.array([0, 0]), np.ones(2)
     assert unlike(levels, np.array([1.0, 1e-5]), sizes) and not unlike(levels, np.array([1.0, 1e-11]), sizes)
-    assert unlike(levels, np.array([1.0, 1e-11]), np.array([1.0, 1e-11])) and not unlike(
-        levels, np.array([1.0, 0.0]), sizes
-    )
+    assert unlike(levels, np.array([1.0, 1e-11]), np.array([1.0, 1e-11])) and not unlike(levels, np.array([1.0, 0.0]), sizes)
 
 
 @pytest.mark.parametrize(("length", "time"), [(1e6, 1.0), (1e6, 1e6), (1e-6, 1e-6), (1e-6, 1.0)])
@@ -233,9 +233,7 @@ def test_the_reduction_is_the_same_in_any_unit_of_time(build, time):
     mechanism, program = build()
     units = dict.fromkeys(mechanism.q.names, "m")
     plain, other = sv.derive(mechanism, program), sv.derive(*in_units(mechanism, program, units, 1.0, 1.0, time))
-    assert other.free == plain.free and [r.order for r in other.reduction.rows] == [
-        r.order for r in plain.reduction.rows
-    ]
+    assert other.free == plain.free and [r.order for r in other.reduction.rows] == [r.order for r in plain.reduction.rows]
 
 
 @pytest.mark.parametrize(("length", "mass"), [(1e-6, 1.0), (1e-3, 1e-9), (1e6, 1e3)])
@@ -244,9 +242,7 @@ def test_the_size_of_a_balance_decides_nothing(length, mass):
     mechanism, program = gallery["flexible-joint"].build()
     plain = sv.derive(mechanism, program)
     other = sv.derive(*in_units(mechanism, program, mechanism.units, length, mass))
-    assert [(r.derivation, r.order) for r in other.reduction.rows] == [
-        (r.derivation, r.order) for r in plain.reduction.rows
-    ]
+    assert [(r.derivation, r.order) for r in other.reduction.rows] == [(r.derivation, r.order) for r in plain.reduction.rows]
     x = plain.start(t=0.4).values
     assert other.start(t=0.4).values == pytest.approx(x, abs=1e-9 * np.abs(x).max())
 
@@ -289,9 +285,7 @@ STEP = 1e-2  # s
 def test_poles_within_the_stability_of_rk4_keep_the_motion(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
-    run = sv.simulate(
-        model, start, (0.0, 2.0), method=sv.methods.RungeKutta(4, step=STEP), drift=sv.methods.Poles(STEP / speed)
-    )
+    run = sv.simulate(model, start, (0.0, 2.0), method=sv.methods.RungeKutta(4, step=STEP), drift=sv.methods.Poles(STEP / speed))
     assert np.abs(run["theta"] - cf.appell_hamel(run.t)["theta"]).max() < 1e-6
     assert np.abs(run.residual["string"][0]).max() < 1e-6
 
@@ -302,9 +296,7 @@ def test_poles_beyond_it_are_told(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
     with pytest.raises(sv.errors.ServoError) as caught:
-        sv.simulate(
-            model, start, (0.0, 10.0), method=sv.methods.RungeKutta(4, step=STEP), drift=sv.methods.Poles(STEP / speed)
-        )
+        sv.simulate(model, start, (0.0, 10.0), method=sv.methods.RungeKutta(4, step=STEP), drift=sv.methods.Poles(STEP / speed))
     assert "poles" in str(caught.value)
 
 
