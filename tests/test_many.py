@@ -417,7 +417,7 @@ def signals_equal_runs(model, many, start, span, method=None, names=None):
 
 
 @pytest.mark.parametrize(
-    ("name", "span"),
+    ("name", "span", "count"),
     [("overhead-crane", (0.0, 6.0), 0), ("crane-3d", (2.0, 0.0), 5), ("appell-hamel", (0.0, 1.0), 0),
      ("rolling-disc", (0.0, 0.5), 5), ("reaction-wheels", (0.0, 0.3), 5), ("constant-jerk", (0.0, 0.2), 5)],
 )

@@ -93,7 +93,7 @@ def rod(length, guess=None):
 ROD_STARTS = [{"x": 1.0, "dy": 0.0}, {"x": 1.0, "dy": 0.5}, {"y": 0.0, "dy": 0.0}, {"x": 0.0, "dx": 7.0}]
 
 
-@pytest.mark.parametrize(("start", "guessed"), zip(ROD_STARTS, (False, True, False, True), strict=True), ids=str)
+@pytest.mark.parametrize(("start", "guessed"), [*zip(ROD_STARTS, (False, True, False, True), strict=True)], ids=str)
 def test_the_rank_of_a_rod_does_not_depend_on_its_length(start, guessed):
     """Rows of (3.18) hold quotients of pivots, which go to infinity each time the rod is level or upright."""
     ends = []
