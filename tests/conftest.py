@@ -43,15 +43,18 @@ def c_compiler(monkeypatch):
         pytest.skip("needs a compiler")
 
 
+@pytest.fixture
+def uncompiled(monkeypatch):
+    """No compiler, where each model is evaluated too few times to be worth compiling."""
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    monkeypatch.setattr(compiler, "_warned", True)
+
+
 @pytest.fixture(params=("c", "casadi"))
 def backend(request, monkeypatch):
     """Compiled code in every grid and loop, and CasADi where there is no compiler."""
     monkeypatch.setattr(function, "GRID_POINTS", 0)
-    if request.param == "c":
-        request.getfixturevalue("c_compiler")
-    else:
-        monkeypatch.setenv("SERVOCTL_COMPILER", "none")
-        monkeypatch.setattr(compiler, "_warned", True)
+    request.getfixturevalue("c_compiler" if request.param == "c" else "uncompiled")
     return request.param
 
 

@@ -85,7 +85,7 @@ def test_the_arm_near_its_base_ends_on_its_own_elbow():
         assert run.counters["steps"] == moved("near", [3.0]).counters["steps"]
 
 
-@pytest.mark.parametrize("path", ["spiral", "nearer"])
+@pytest.mark.parametrize("path", ["nearer"])
 def test_samples_are_output_only(path):
     """The same motion at other instants: the forces, too."""
     whole = moved(path, np.linspace(0, 3, 601))

@@ -204,7 +204,7 @@ def test_a_pole_that_falls_is_unstable_over_any_longer_time():
     cart = sv.Mechanism(q, S, potential=0.5 * 9.81 * bob[1], actuators={"motor": x})
     path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.5, smoothness=4)
     model = sv.derive(cart, sv.Program({"cart": x - path}, by="actuators"))
-    for length in (0.75, 1.0, 1.5, 2.0, 3.0, 4.0):
+    for length in (0.75, 1.5, 4.0):
         with warned("unstable"):
             run = sv.simulate(model, model.start(), (0.0, length))
         assert run.internal["verdict"] == "unstable" and 15 < run.internal["growth"] < 25
@@ -305,7 +305,7 @@ def ball_on_a_table(radius=0.1, mass=1.0, table=2.0):
     return sv.derive(mechanism, sv.Program({"table": s - 1.4}))
 
 
-@pytest.mark.parametrize("length", [10.0, 60.0])
+@pytest.mark.parametrize("length", [60.0])
 def test_a_ball_on_a_turning_table_is_neutral(length):
     model = ball_on_a_table()
     start = model.start(X=0.5, Y=0.0, phi=0.0, e0=1.0, e1=0.0, e2=0.0, e3=0.0, vx=0.0, vy=0.3, w3=0.2)
@@ -336,7 +336,7 @@ def test_a_tilted_ball_in_its_own_axes_is_neutral(tilt, samples):
     assert run.internal["verdict"] == sv.internal_dynamics(run).verdict == "neutral"
 
 
-@pytest.mark.parametrize("length", [5.0, 10.0, 60.0])
+@pytest.mark.parametrize("length", [60.0])
 def test_a_spinning_satellite_is_neutral(length):
     example = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "quaternion.py"), run_name="example")
     model = sv.derive(example["mechanism"], example["program"])
@@ -516,7 +516,7 @@ def test_deviations_take_no_more_steps_than_they_may():
     assert not along(model, 17, np.linspace(0.0, 8.0, flow.MOST_ALONG + 2), x, size, ["x", "dx"]).move()
 
 
-@pytest.mark.parametrize("name", ["appell-hamel", "passive-arm", "pendubot"])
+@pytest.mark.parametrize("name", ["appell-hamel", "passive-arm"])
 def test_tangents_span_the_kernel_of_the_gradients(name, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     x = model.start(**scene.start, guess=scene.guess).values

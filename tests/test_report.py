@@ -411,7 +411,7 @@ def test_reports_are_short_and_serve_json(name, gallery_model):
         assert json.loads(json.dumps(report.as_dict(), allow_nan=False)) == report.as_dict()
 
 
-@pytest.mark.parametrize("name", ["vtol-centre", "overhead-crane", "two-cars-ideal"])
+@pytest.mark.parametrize("name", ["overhead-crane", "two-cars-ideal"])
 def test_the_figure_of_a_report(name, gallery_model, tmp_path):
     model = gallery_model(name)
     for what in (model, scene_run(name, model)):

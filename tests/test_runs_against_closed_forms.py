@@ -329,7 +329,7 @@ def test_relative_degree_is_lost_at_an_angle(links, degrees):
     assert np.rad2deg(lost) == pytest.approx(degrees, abs=5e-5 if links == "unit" else 5e-7)
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau", "Taylor", "RK4"])
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK4"])
 def test_the_unstable_arm_stops_where_the_relative_degree_is_lost(method):
     model = arm("unit")
     options = {"step": 1e-3} if method == "RK4" else {}

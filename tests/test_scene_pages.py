@@ -24,6 +24,7 @@ def told(page):
 
 
 @pytest.mark.parametrize("name", gallery)
+@pytest.mark.usefixtures("uncompiled")
 def test_the_page_of_a_scene_is_what_its_code_says_and_prints(name):
     written, run = WRITER["scene_page"](name)
     (words, numbers), (shown, stored) = told(written), told((DOCS / "gallery" / f"{name}.md").read_text(encoding="utf-8"))

@@ -9,18 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from judge import judge
 from machines import Case, cases, from_text, moved, seeded
 
-from servoctl.codegen import compiler
-
+pytestmark = pytest.mark.usefixtures("uncompiled")
 CASES = 80  # about 0.2 s each; run.py runs as many as one likes
-
-
-@pytest.fixture(autouse=True, scope="module")
-def uncompiled():
-    """Each model is evaluated too few times to be worth compiling."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SERVOCTL_COMPILER", "none")
-        patch.setattr(compiler, "_warned", True)
-        yield
 
 
 @settings(max_examples=CASES, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck))

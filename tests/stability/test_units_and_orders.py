@@ -152,6 +152,7 @@ REFUSED = {("spiral", 1e-6, 1e-3, 1.0), ("spiral", 1.0, 1.0, 1e6)}
 
 
 @pytest.mark.parametrize("name", [*KINDS, "hopper", "reaction-wheels", "trailers"])
+@pytest.mark.usefixtures("uncompiled")
 def test_a_scene_moves_alike_in_any_unit(name):
     """From micrometres to megametres, grams to tonnes, microseconds to megaseconds, along the whole motion."""
     scene = gallery[name]
@@ -293,7 +294,7 @@ def test_poles_beyond_it_are_told(speed, gallery_model):
     assert "poles" in str(caught.value)
 
 
-@pytest.mark.parametrize("speed", [1e2, 1e4])
+@pytest.mark.parametrize("speed", [1e4])
 def test_an_implicit_method_bears_any_poles(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
