@@ -29,6 +29,7 @@ from servoctl.model.model import derive
 from servoctl.model.variants import derived_near
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
+FULLY_OPTIMISED, function.FULLY_OPTIMISED = function.FULLY_OPTIMISED, 0  # they compile much and run shortly: -O1
 with warnings.catch_warnings():  # of a CC that names no program
     warnings.simplefilter("ignore")
     compiler._warned = compiler.compiler() is None  # without one the whole suite runs in CasADi

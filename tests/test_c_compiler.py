@@ -8,6 +8,7 @@ import warnings
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import FULLY_OPTIMISED
 from refusals import warned
 from test_compiled_functions import P1, RK4, X2, T, function, numpy_rk4, pendulum
 
@@ -24,6 +25,7 @@ from servoctl.shell.main import main
 def fresh(tmp_path, monkeypatch, c_compiler):
     """As in a new process with an empty cache; the list holds the compiler's commands."""
     monkeypatch.setenv("SERVOCTL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(functions, "FULLY_OPTIMISED", FULLY_OPTIMISED)
     new_process(monkeypatch)
     commands, run = [], subprocess.run
     monkeypatch.setattr(subprocess, "run", lambda command, **rest: commands.append(command) or run(command, **rest))

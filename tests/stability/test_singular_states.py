@@ -52,7 +52,7 @@ def test_a_crane_stops_where_its_load_falls_freely(duration):
     assert run["hoist"][early] == pytest.approx(reference["hoist"][early], rel=1e-8)
 
 
-@pytest.mark.parametrize("method", ["Taylor", "RK4", "RadauIIA"])
+@pytest.mark.parametrize("method", ["Taylor", "RK4"])
 def test_an_integrated_crane_stops_there_too(method):
     model = sv.derive(*overhead_crane(1.3))
     with pytest.raises(sv.errors.SingularProgram) as caught:
