@@ -29,6 +29,7 @@ from servoctl.model.model import derive
 from servoctl.model.variants import derived_near
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
+FULLY_OPTIMISED, function.FULLY_OPTIMISED = function.FULLY_OPTIMISED, 0  # they compile much and run shortly: -O1
 with warnings.catch_warnings():  # of a CC that names no program
     warnings.simplefilter("ignore")
     compiler._warned = compiler.compiler() is None  # without one the whole suite runs in CasADi
@@ -43,15 +44,18 @@ def c_compiler(monkeypatch):
         pytest.skip("needs a compiler")
 
 
+@pytest.fixture
+def uncompiled(monkeypatch):
+    """No compiler, where each model is evaluated too few times to be worth compiling."""
+    monkeypatch.setenv("SERVOCTL_COMPILER", "none")
+    monkeypatch.setattr(compiler, "_warned", True)
+
+
 @pytest.fixture(params=("c", "casadi"))
 def backend(request, monkeypatch):
     """Compiled code in every grid and loop, and CasADi where there is no compiler."""
     monkeypatch.setattr(function, "GRID_POINTS", 0)
-    if request.param == "c":
-        request.getfixturevalue("c_compiler")
-    else:
-        monkeypatch.setenv("SERVOCTL_COMPILER", "none")
-        monkeypatch.setattr(compiler, "_warned", True)
+    request.getfixturevalue("c_compiler" if request.param == "c" else "uncompiled")
     return request.param
 
 

@@ -1,14 +1,17 @@
 """Numbers of scenes: a pair for each run, as measured and by a closed form or a computation without servoctl."""
 
+import re
 from itertools import product
 from math import cos, pi, sin, sqrt
 
 import closed_forms
 import numpy as np
+import pytest
 from closed_forms import GRAVITY
 from scipy.special import ellipj
 
 import servoctl as sv
+from servoctl.gallery import gallery
 from servoctl.gallery.six_axes import AXES, HOME
 
 
@@ -241,7 +244,54 @@ def steady_satellite(run):
     return np.hypot(run["d2x"], run["d2y"])[-1], 3.986e14 / 7e6**2
 
 
-MORE = {
+def largest(signal, closed_form):
+    """The largest magnitude of a signal, by a function of time that returns it by name."""
+    return lambda run: (np.abs(run[signal]).max(), np.abs(closed_form(run.t)[signal]).max())
+
+
+def decay(run):
+    """The slowest decay of the internal dynamics, at the start [1/s]."""
+    return -sv.internal_dynamics(run).eigenvalues[:, 0].real.max()
+
+
+def swing(run):
+    """Frequency [rad/s] of the pendubot's second link about the hanging pose, m2 g l2/2 over I2 + m2 l2²/4."""
+    inertia, damping = 0.07 + 3.0 * 0.25**2, 0.05
+    rate = np.sqrt(3.0 * 9.81 * 0.25 / inertia - (damping / inertia / 2) ** 2)
+    return np.abs(sv.internal_dynamics(run).eigenvalues[:, 0].imag).max(), rate
+
+
+def three_cars(t):
+    return closed_forms.cars(t, (1.0, 1.0, 2.0), (1.0, 1.0), (0.5, 0.5))
+
+
+def mass_on_car(t):
+    return closed_forms.mass_on_car(t, pi / 4, 1.0)
+
+
+NUMBERS = {
+    "overhead-crane": largest("hoist", closed_forms.overhead_crane),
+    "winch-crane": largest("winch", closed_forms.winch_crane),
+    "crane-3d": largest("tension", closed_forms.crane_3d),
+    "two-cars": largest("force", closed_forms.cars),
+    "three-cars": largest("force", three_cars),
+    "vtol": largest("u1", closed_forms.vtol),
+    "overhead-crane-redundant": largest("trolley", closed_forms.overhead_crane),
+    "winch-crane-redundant": largest("tension", closed_forms.winch_crane),
+    "crane-3d-redundant": largest("hoist", closed_forms.crane_3d),
+    "mass-on-car-absolute": largest("force", mass_on_car),
+    "mass-on-car": lambda run: (decay(run), -closed_forms.mass_on_car_poles(pi / 4).real.max()),
+    "passive-arm": lambda run: (decay(run), -closed_forms.passive_arm_poles(0.3, 10.0, 1.0).real.max()),
+    "pendubot": swing,
+    "vtol-centre": lambda run: (-decay(run), closed_forms.vtol_rate()),
+    "two-link-arm": lambda run: (run["q2"][0], np.arccos((0.6**2 + 0.4**2 - 0.6**2 - 0.5**2) / (2 * 0.6 * 0.5))),
+    "appell-hamel": largest("tension", closed_forms.appell_hamel),
+    "two-cars-ideal": lambda run: (
+        np.abs(run.signals("reaction")[1][0]).max(), np.abs(closed_forms.cars_ideal(run.t)["reaction"]).max(),
+    ),  # fmt: skip
+    "constant-speed": lambda run: (-run["y"][-1], -closed_forms.constant_speed(run.t)["y"][-1]),
+    "spiral": lambda run: (run["y"][-1], closed_forms.spiral(run.t, 3)["y"][-1]),
+    "wheeled-robot": lambda run: (run["curvature"].max(), pi / 4),
     "rotary-crane": rotary_crane,
     "beam-crane": beam_crane,
     "hopper": hopper,
@@ -269,3 +319,10 @@ MORE = {
     "tumbling-satellite": tumbling_satellite,
     "jerkless-trolley": lambda run: (_largest(run, "theta"), 2 * np.arctan(4.0 / GRAVITY)),
 }
+ENDS = {"appell-hamel-squared": closed_forms.WHEEL_STOPS, "constant-speed-horizontal": 5.0 / GRAVITY}  # s
+
+
+def quoted(name, number):
+    """Whether the sentence of a scene about its number has it, to the digits that it shows."""
+    printed = re.findall(r"\d+(?:\.\d+)?", gallery[name].number)
+    return any(float(text) == pytest.approx(number, rel=5e-4) for text in printed)

@@ -16,7 +16,7 @@ from servoctl.methods.choice import as_method
 from servoctl.shell.main import main
 
 INTEGRATED = ("appell-hamel", "two-cars-ideal", "mass-on-car", "passive-arm", "pendubot", "wheeled-robot")
-ASKED = [*((name, accuracy) for name in INTEGRATED for accuracy in (1e-4, 1e-6, 1e-9)), ("spiral", 1e-6)]
+ASKED = [*((name, 1e-9) for name in INTEGRATED), ("appell-hamel", 1e-4), ("spiral", 1e-6)]
 SOLVED = ("overhead-crane", "winch-crane-redundant", "three-cars", "vtol")
 
 
@@ -157,7 +157,7 @@ def test_the_command_passes_the_accuracy_on(tmp_path, monkeypatch):
     assert given == {"accuracy": 1e-6}
 
 
-@pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-6, 1e-7, 1e-8, 1e-10])
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-6, 1e-10])
 def test_a_motion_is_never_compared_with_itself(accuracy):
     """y'' = k (x - y) with x on a sine: y = 0.9 sin t is exact, errors grow as exp(3t)."""
     q, k = sv.coordinates("x y"), 9.0
@@ -198,11 +198,8 @@ def elongation(t, damping, stiffness, y0):
     "damping, stiffness, end, method",
     [
         (1e3, 1.0, 10.0, "RadauIIA"),
-        (1e5, 1e3, 10.0, "RadauIIA"),
         (3e3, 1e6, 10.0, "RadauIIA"),
         (0.1, 1.0, 10.0, "Taylor"),
-        (0.0, 1e4, 10.0, "Taylor"),
-        (3.0, 1e6, 2.0, "Taylor"),
         (10.0, 1.0, 100.0, "Taylor"),
     ],
 )

@@ -51,10 +51,6 @@ def cubic(e, k, c):
     return k * e**2 / 2 + c * e**4 / 4
 
 
-def scaled(x):
-    return ca.diag(ca.vertcat(*(1.0 + 0.3 * i for i in range(len(x)))))
-
-
 def by_place(x):
     return ca.diag(ca.vertcat(*(1.0 / (1.5 + ca.sin(e)) for e in x)))
 
@@ -182,7 +178,6 @@ def test_a_deep_plan_takes_few_operations_and_agrees_with_series(name):
 ALIKE = {
     "cubic springs": lambda: chain(3, cubic),
     "discs": lambda: chain(3, linear, weight),
-    "scaled velocities": lambda: chain(3, cubic, frame=scaled),
     "velocities by place": lambda: chain(3, linear, frame=by_place),
     "distances": lambda: chain(4, linear, relative=True),
     "velocities between cars": lambda: chain(3, cubic, frame=differences),

@@ -243,7 +243,7 @@ def test_collected_rates_are_as_accurate_in_all_units(scene):
 
 @extended
 @np.errstate(all="ignore")
-@pytest.mark.parametrize("scene", ("overhead-crane", "crane-3d", "vtol", "slung-load", "rotary-crane", "three-cars", "beam-crane"))
+@pytest.mark.parametrize("scene", ("overhead-crane", "vtol", "slung-load", "beam-crane"))
 def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):
     """Against extended precision, at states near the path and on its knots, where conditions decide alike."""
     model = gallery_model(scene)

@@ -632,7 +632,7 @@ def test_options_beyond_their_bounds_are_refused(argv, capsys):
     assert ended.value.code == 2 and argv[2] in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("delay", ["9999999", "999999999999999999999999999999", "1001"])
+@pytest.mark.parametrize("delay", ["999999999999999999999999999999", "1001"])
 def test_a_delay_beyond_its_bound_is_a_sentence(delay, capsys):
     assert main(["run", "overhead-crane", "--no-figures", "--law", "computed", "--delay", delay]) in (1, 2)
     assert "delay" in capsys.readouterr().out

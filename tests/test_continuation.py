@@ -64,8 +64,8 @@ def moved(path, t_eval=None, elbow=1, span=(0.0, 3.0)):
     return sv.simulate(arm(path)[0], begin(path, elbow, span[0]), span, t_eval=t_eval)
 
 
-SAMPLES = [[3.0], [1.7, 1.701, 3.0], np.linspace(0, 3, 1001), *(np.append(np.arange(0, 3, h), 3.0) for h in (0.45, 0.3))]
-BRANCHES = [("spiral", 1), ("spiral", -1), ("circle", 1), ("beside", -1), ("near", 1), ("nearer", -1), ("knots", 1)]
+SAMPLES = [[3.0], [1.7, 1.701, 3.0], np.linspace(0, 3, 1001), np.append(np.arange(0, 3, 0.45), 3.0)]
+BRANCHES = [("spiral", -1), ("circle", 1), ("nearer", -1), ("knots", 1)]
 
 
 @pytest.mark.parametrize(("path", "elbow"), BRANCHES)
@@ -85,7 +85,7 @@ def test_the_arm_near_its_base_ends_on_its_own_elbow():
         assert run.counters["steps"] == moved("near", [3.0]).counters["steps"]
 
 
-@pytest.mark.parametrize("path", ["spiral", "nearer"])
+@pytest.mark.parametrize("path", ["nearer"])
 def test_samples_are_output_only(path):
     """The same motion at other instants: the forces, too."""
     whole = moved(path, np.linspace(0, 3, 601))

@@ -9,46 +9,24 @@ import numpy as np
 import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+SCRIPTS, DOCS = sorted(EXAMPLES.glob("*.py")), EXAMPLES.parent / "docs"
 
 
-@pytest.fixture(scope="module")
-def numbers():
-    """A function from an example's name to what its `main(fast=True)` returns."""
-    results = {}
-
-    def run(name):
-        if name not in results:
-            results[name] = runpy.run_path(str(EXAMPLES / f"{name}.py"))["main"](fast=True)
-        return results[name]
-
-    return run
-
-
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_every_example_is_verified_and_returns_numbers(numbers, path):
-    result = numbers(path.stem)
-    checks = [value for name, value in result.items() if name.endswith("verified")]
-    assert checks and all(checks)
-    assert all(np.isfinite(value) for value in result.values())
-
-
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_every_example_explains_itself_and_runs_as_a_script(path):
     text = path.read_text(encoding="utf-8")
     assert text.startswith('"""')
     assert 'if __name__ == "__main__":' in text
 
 
-def test_appell_hamel(numbers):
-    result = numbers("appell_hamel")
+def appell_hamel(result):
     assert result["free"] == 6
     state = [result[name] for name in ("x", "y", "z", "phi", "theta", "dphi", "dtheta")]
     assert np.abs(np.array(state) - known.APPELL_HAMEL_STATES[2.0]).max() < 1e-8
     assert result["energy drift"] < 1e-8
 
 
-def test_overhead_crane(numbers):
-    result = numbers("overhead_crane")
+def overhead_crane(result):
     assert (result["free"], result["index"]) == (0, 5)
     exact = known.overhead_crane(np.linspace(0.0, 8.0, 80_001))
     for name in ("trolley", "hoist", "theta"):
@@ -60,8 +38,7 @@ def test_overhead_crane(numbers):
     assert np.rad2deg([result["theta min"], result["theta max"]]) == pytest.approx((-7.1814, 7.9766), abs=1e-4)
 
 
-def test_two_cars(numbers):
-    result = numbers("two_cars")
+def two_cars(result):
     assert result["ideal max"] == pytest.approx(6.852059, abs=1e-6)
     assert result["ideal at"] == pytest.approx(0.7091, abs=1e-4)
     assert result["ideal swing"] == pytest.approx(1.966911, abs=1e-6)
@@ -75,16 +52,15 @@ def test_two_cars(numbers):
     assert result["actuators max"] == pytest.approx(known.cars(t)["force"].max(), rel=1e-6)
 
 
-def test_spiral(numbers):
-    result, exact = numbers("spiral"), known.spiral(np.array(2.0), 5, c=1.5)
+def spiral(result):
+    exact = known.spiral(np.array(2.0), 5, c=1.5)
     assert result["free"] == 7
     assert result["heading"] == pytest.approx(1.0, abs=1e-9)
     assert (result["x"], result["y"]) == pytest.approx((float(exact["x"]), float(exact["y"])), abs=1e-9)
     assert result["speed error"] < 1e-8
 
 
-def test_redundant_thrusters(numbers):
-    result = numbers("redundant_thrusters")
+def redundant_thrusters(result):
     for case in ("equal", "weak bow", "wish"):
         assert result[f"{case} against the least norm"] < 1e-12 and result[f"{case} verified"]
     assert result["weak bow bow"] < result["equal bow"] / 3
@@ -92,8 +68,7 @@ def test_redundant_thrusters(numbers):
     assert result["wish bow"] > result["equal bow"] + 1.0
 
 
-def test_quaternion(numbers):
-    result = numbers("quaternion")
+def quaternion(result):
     t = np.linspace(0.0, 10.0, 1001)
     rate, acceleration = (known.rest_to_rest(t, k, 0.0, np.pi / 3, 10.0, 2) for k in (1, 2))
     torque = np.hypot(40.0 * acceleration, 60.0 * 0.5 * rate)
@@ -103,18 +78,16 @@ def test_quaternion(numbers):
     assert result["unit error"] < 1e-14
 
 
-def test_designed_arm(numbers):
+def designed_arm(result):
     """Both torques are at a limit."""
-    result = numbers("designed_arm")
     assert result["designed [s]"] == pytest.approx(0.718014, abs=1e-5)
     assert (result["via x [m]"], result["via y [m]"]) == pytest.approx((0.44518, 0.62279), abs=1e-4)
     assert 45.0 * (1 - 1e-5) < result["shoulder [N m]"] <= 45.0 and 5.0 * (1 - 1e-5) < result["elbow [N m]"] <= 5.0
     assert result["gain"] < 1e-4
 
 
-def test_robot_arm(numbers):
+def robot_arm(result):
     """Without an integral the unknown 2 kg deflect the arm as its gains are stiff; with it they are carried."""
-    result = numbers("robot_arm")
     assert result["free"] == 0
     assert result["LQR: at the end [mm]"] > 20 * result["LQR with integral: at the end [mm]"]
     assert result["LQR with integral: at the end [mm]"] < 1.0 and result["LQR with integral: at the end [mrad]"] < 1.0
@@ -126,24 +99,21 @@ LOST = 15.0 * 9.81  # N: the weight that the crane's laws do not know of
 PATH_END, END = "at 6 s [mm]", "at the end [mm]"
 
 
-def test_closed_loop_crane_falls_under_feedforward_alone(numbers):
-    result = numbers("closed_loop_crane")
+def closed_loop_crane_falls_under_feedforward_alone(result):
     assert result[f"feedforward: {PATH_END}"] == pytest.approx(22.4e3, rel=0.01)
     for what, t in ((PATH_END, 6.0), (END, 8.0)):  # hoist and load, 120 kg, under the weight that nothing carries
         assert result[f"feedforward: {what}"] == pytest.approx(1e3 * LOST / 120.0 * t**2 / 2, rel=0.02)
 
 
-def test_closed_loop_crane_deflects_as_each_law_is_stiff(numbers):
+def closed_loop_crane_deflects_as_each_law_is_stiff(result):
     """What remains without an integral: weight over gain; for computed, 6 T² of the acceleration that is wrong."""
-    result = numbers("closed_loop_crane")
     assert result[f"PD: {END}"] == pytest.approx(1e3 * LOST / 8000.0, rel=0.03)
     assert result[f"LQR: {END}"] == pytest.approx(1e3 * LOST / 1000.0, rel=0.03)
     for T in (0.25, 0.06):
         assert result[f"computed, {T} s: {END}"] == pytest.approx(1e3 * 6 * T**2 * LOST / 105.0, rel=0.002)
 
 
-def test_closed_loop_crane_comes_back_where_the_law_integrates_or_knows(numbers):
-    result = numbers("closed_loop_crane")
+def closed_loop_crane_comes_back_where_the_law_integrates_or_knows(result):
     assert 140.0 <= result[f"LQR: {PATH_END}"] <= 160.0
     for name, worst, at_6, end in (
         ("LQR with integral", 60.0, 10.0, 3.0),
@@ -157,9 +127,8 @@ def test_closed_loop_crane_comes_back_where_the_law_integrates_or_knows(numbers)
     assert result["limited: trolley [N]"] <= 150.0 < result["LQR with integral: trolley [N]"]
 
 
-def test_closed_loop_crane_with_noise_and_delay(numbers):
+def closed_loop_crane_with_noise_and_delay(result):
     """Little worse than without; but poles of 1/0.06 s turn the noise into a hundred times the plan's force."""
-    result = numbers("closed_loop_crane")
     for name in ("PD", "computed, 0.25 s", "LQR", "LQR with integral", "output feedback"):
         quiet, noisy = (result[f"{before}{name}: worst [mm]"] for before in ("", "noise, "))
         assert noisy == pytest.approx(quiet, rel=0.03)
@@ -169,9 +138,8 @@ def test_closed_loop_crane_with_noise_and_delay(numbers):
     assert result["noise, LQR with integral: trolley [N]"] < 400.0
 
 
-def test_closed_loop_crane_with_a_weak_trolley(numbers):
+def closed_loop_crane_with_a_weak_trolley(result):
     """The plan needs 138 N of 100: bounded by allocation, and slowed to 80 N it runs without slack."""
-    result = numbers("closed_loop_crane")
     assert result["the plan needs [N]"] == pytest.approx(-137.991607, abs=1e-5)
     for name in ("overloaded, clipped", "overloaded, limited", "slowed"):
         assert result[f"{name}: trolley [N]"] <= 100.0
@@ -192,23 +160,21 @@ MACHINES = {  # at most: worst and last error (m, rad); feedforward alone is wor
 }
 
 
-@pytest.mark.parametrize("name", MACHINES)
-def test_closed_loops_stay_near_their_plans(numbers, name):
-    result, (worst, last, factor) = numbers("closed_loops"), MACHINES[name]
-    assert result[f"{name}: worst"] < worst and result[f"{name}: last"] < last
-    assert result[f"{name}: feedforward worst"] > factor * result[f"{name}: worst"]
+def closed_loops_stay_near_their_plans(result):
+    for name, (worst, last, factor) in MACHINES.items():
+        assert result[f"{name}: worst"] < worst and result[f"{name}: last"] < last, name
+        assert result[f"{name}: feedforward worst"] > factor * result[f"{name}: worst"], name
 
 
-def test_closed_loops_show_what_computed_actuation_cannot_do(numbers):
+def closed_loops_show_what_computed_actuation_cannot_do(result):
     """A curvature says nothing of the place; and the upright pendubot's eigenvalue is that of its linearisation."""
-    result = numbers("closed_loops")
     assert result["wheeled robot: computed last"] > 5 * result["wheeled robot: worst"]
     inertia, torque, damping = 0.07 + 3.0 * 0.25**2, 3.0 * 9.81 * 0.25, 0.05  # of the second link about the elbow
     assert result["pendubot: eigenvalue"] == pytest.approx(max(np.roots([inertia, damping, -torque])), rel=1e-4)
 
 
-def test_the_table_of_other_machines_is_what_the_example_says(numbers):
-    result, page = numbers("closed_loops"), (EXAMPLES.parent / "docs" / "closed_loop.md").read_text(encoding="utf-8")
+def the_table_of_other_machines_is_what_the_example_says(result):
+    page = (DOCS / "closed_loop.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| ([^|]+) \| [^|]+ \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \|$", page, re.M)
     assert [row[0] for row in rows] == list(MACHINES)
     for name, *cells in rows:
@@ -217,10 +183,46 @@ def test_the_table_of_other_machines_is_what_the_example_says(numbers):
             assert cell == f"{result[f'{name}: {what}']:.{digits}f}"
 
 
-def test_the_page_of_examples_has_all_of_them_and_their_numbers(numbers):
-    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", (EXAMPLES.parent / "docs" / "examples.md").read_text(encoding="utf-8"), re.M)
-    assert sorted(name for name, _ in rows) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
-    shown = [(name, *number) for name, cell in rows for number in re.findall(r"`([^`]+)` (-?[\d.]*\d)", cell)]
-    assert len(shown) > 20
-    for name, what, number in shown:
-        assert number == f"{numbers(name)[what]:.{len(number.partition('.')[2])}f}"
+# every example ---------------------------------------------------------------------------------------------------------
+
+CHECKS = {  # of what an example returns; it has a check of its name, or these
+    "closed_loop_crane": (
+        closed_loop_crane_falls_under_feedforward_alone, closed_loop_crane_deflects_as_each_law_is_stiff,
+        closed_loop_crane_comes_back_where_the_law_integrates_or_knows, closed_loop_crane_with_noise_and_delay,
+        closed_loop_crane_with_a_weak_trolley,
+    ),
+    "closed_loops": (
+        closed_loops_stay_near_their_plans, closed_loops_show_what_computed_actuation_cannot_do,
+        the_table_of_other_machines_is_what_the_example_says,
+    ),
+    **{check.__name__: (check,) for check in (
+        appell_hamel, overhead_crane, two_cars, spiral, redundant_thrusters, quaternion, designed_arm, robot_arm,
+    )},
+}  # fmt: skip
+
+
+def in_the_page():
+    """{example: ((name of a number, number as text), ...)} of docs/examples.md."""
+    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", (DOCS / "examples.md").read_text(encoding="utf-8"), re.M)
+    return {name: re.findall(r"`([^`]+)` (-?[\d.]*\d)", cell) for name, cell in rows}
+
+
+def test_the_page_of_examples_has_all_of_them():
+    assert sorted(in_the_page()) == [path.stem for path in SCRIPTS] and sum(map(len, in_the_page().values())) > 20
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_every_example_is_verified_and_returns_numbers(path):
+    """Those of the page, and of its checks."""
+    result = runpy.run_path(str(path))["main"](fast=True)
+    verified = [value for name, value in result.items() if name.endswith("verified")]
+    assert verified and all(verified)
+    assert all(np.isfinite(value) for value in result.values())
+    for what, number in in_the_page()[path.stem]:
+        assert number == f"{result[what]:.{len(number.partition('.')[2])}f}", what
+    for check in CHECKS.get(path.stem, ()):
+        check(result)
+
+
+def test_checks_are_of_examples():
+    assert {*CHECKS} <= {path.stem for path in SCRIPTS}

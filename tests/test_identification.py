@@ -37,15 +37,15 @@ def log(loop):
     return {"t": loop.t, **loop.input, **loop.measured}
 
 
-def test_load_and_friction_of_the_crane_are_within_three_deviations_in_95_of_100_runs(crane):
+def test_load_and_friction_of_the_crane_are_within_three_deviations_in_39_of_40_runs(crane):
     run, guess = crane
     deviations = []
-    for seed in range(100):
+    for seed in range(40):
         found = sv.identify(guess, run(seed), list(TRUE))
         assert found.success and not found.unseen
         deviations.append([(found[name] - value) / found.deviation(name) for name, value in TRUE.items()])
     within = (np.abs(deviations) < 3.0).all(axis=1)
-    assert within.sum() >= 95
+    assert within.sum() >= 39
     assert 0.8 < np.std(deviations) < 1.25  # neither too cautious nor too sure
 
 

@@ -170,22 +170,21 @@ def test_a_period_that_is_none_is_refused():
         sv.internal_dynamics(run, period=-1.0)
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize(
-    "acceleration, length, verdict, growth",
+    "acceleration, scale, length, verdict, growth",
     [
-        (lambda x, v, t: 0 * x, 50.0, "neutral", (1.0, 2.0)),  # adrift
-        (lambda x, v, t: -1e4 * x, 3.0, "neutral", (1.0, 1.1)),  # quick
-        (lambda x, v, t: -1e-4 * x, 10.0, "neutral", (1.0, 2.0)),  # slow
-        (lambda x, v, t: -0.3 * v - x, 40.0, "stable", (1.0, 1.1)),
-        (lambda x, v, t: 4 * x, 5.0, "unstable", (np.exp(10.0) / 1.05, np.exp(10.0) * 1.05)),
-        (lambda x, v, t: 4 * x, 0.1, "neutral", (1.0, 1.5)),  # for so short a time nothing grows
-        (lambda x, v, t: -0.3 * v - (-1 + 34 * ca.cos(15 * t)) * x, 40.0, "stable", (1.0, 10.0)),  # Kapitza's pendulum
-        (lambda x, v, t: -2 * v - (3 - 6 / (1 + ca.exp(-2 * (t - 10)))) * x, 20.0, "unstable", (8e3, 2e4)),  # later
-        (lambda x, v, t: -0.3 * v - x + 25 * ca.exp(-(((t - 50) / 0.5) ** 8)) * x, 100.0, "unstable", (20, 100)),  # once
+        (lambda x, v, t: 0 * x, 1e-6, 50.0, "neutral", (1.0, 2.0)),  # adrift
+        (lambda x, v, t: -1e4 * x, 1e6, 3.0, "neutral", (1.0, 1.1)),  # quick
+        (lambda x, v, t: -1e-4 * x, 1.0, 10.0, "neutral", (1.0, 2.0)),  # slow
+        (lambda x, v, t: -0.3 * v - x, 1e-6, 40.0, "stable", (1.0, 1.1)),
+        (lambda x, v, t: 4 * x, 1e6, 5.0, "unstable", (np.exp(10.0) / 1.05, np.exp(10.0) * 1.05)),
+        (lambda x, v, t: 4 * x, 1.0, 0.1, "neutral", (1.0, 1.5)),  # for so short a time nothing grows
+        (lambda x, v, t: -0.3 * v - (-1 + 34 * ca.cos(15 * t)) * x, 1e-6, 40.0, "stable", (1.0, 10.0)),  # Kapitza's pendulum
+        (lambda x, v, t: -2 * v - (3 - 6 / (1 + ca.exp(-2 * (t - 10)))) * x, 1e6, 20.0, "unstable", (8e3, 2e4)),  # later
+        (lambda x, v, t: -0.3 * v - x + 25 * ca.exp(-(((t - 50) / 0.5) ** 8)) * x, 1.0, 100.0, "unstable", (20, 100)),  # once
     ],
 )
-def test_growth_is_that_of_the_motion_in_any_units(acceleration, length, verdict, growth, scale):
+def test_growth_is_that_of_the_motion_in_any_units(acceleration, scale, length, verdict, growth):
     _, found = moved(passive(acceleration, scale), length, x=scale)
     assert found.verdict == verdict and growth[0] <= found.growth <= growth[1]
 
@@ -205,7 +204,7 @@ def test_a_pole_that_falls_is_unstable_over_any_longer_time():
     cart = sv.Mechanism(q, S, potential=0.5 * 9.81 * bob[1], actuators={"motor": x})
     path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.5, smoothness=4)
     model = sv.derive(cart, sv.Program({"cart": x - path}, by="actuators"))
-    for length in (0.75, 1.0, 1.5, 2.0, 3.0, 4.0):
+    for length in (0.75, 1.5, 4.0):
         with warned("unstable"):
             run = sv.simulate(model, model.start(), (0.0, length))
         assert run.internal["verdict"] == "unstable" and 15 < run.internal["growth"] < 25
@@ -306,7 +305,7 @@ def ball_on_a_table(radius=0.1, mass=1.0, table=2.0):
     return sv.derive(mechanism, sv.Program({"table": s - 1.4}))
 
 
-@pytest.mark.parametrize("length", [10.0, 60.0])
+@pytest.mark.parametrize("length", [60.0])
 def test_a_ball_on_a_turning_table_is_neutral(length):
     model = ball_on_a_table()
     start = model.start(X=0.5, Y=0.0, phi=0.0, e0=1.0, e1=0.0, e2=0.0, e3=0.0, vx=0.0, vy=0.3, w3=0.2)
@@ -316,8 +315,7 @@ def test_a_ball_on_a_turning_table_is_neutral(length):
     assert found.verdict == "neutral" and found.growth < 3
 
 
-@pytest.mark.parametrize("tilt", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.1), (-0.6, 0.1, 0.7)], ids=str)
-@pytest.mark.parametrize("samples", [5, 1001])
+@pytest.mark.parametrize(("tilt", "samples"), [((0.0, 0.0, 0.0), 5), ((-0.6, 0.1, 0.7), 1001)], ids=str)
 def test_a_tilted_ball_in_its_own_axes_is_neutral(tilt, samples):
     """With body-fixed angular velocities: its centre moves in a circle at constant speed, at 2/7 of the table's rate."""
     table, names = 0.7, sv.coordinates("X Y e0 e1 e2 e3")
@@ -338,7 +336,7 @@ def test_a_tilted_ball_in_its_own_axes_is_neutral(tilt, samples):
     assert run.internal["verdict"] == sv.internal_dynamics(run).verdict == "neutral"
 
 
-@pytest.mark.parametrize("length", [5.0, 10.0, 60.0])
+@pytest.mark.parametrize("length", [60.0])
 def test_a_spinning_satellite_is_neutral(length):
     example = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "quaternion.py"), run_name="example")
     model = sv.derive(example["mechanism"], example["program"])
@@ -432,7 +430,7 @@ def test_what_is_unstable_is_warned_of_whatever_the_samples(name, samples):
     assert run.internal["verdict"] == "unstable"
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_the_bound_is_one_of_the_propagator(seed):
     """Random linear motions of two coordinates, forth and back: exp ∫ μ is above the norm in the balanced states."""
     random = np.random.default_rng(seed)
@@ -518,7 +516,7 @@ def test_deviations_take_no_more_steps_than_they_may():
     assert not along(model, 17, np.linspace(0.0, 8.0, flow.MOST_ALONG + 2), x, size, ["x", "dx"]).move()
 
 
-@pytest.mark.parametrize("name", ["appell-hamel", "passive-arm", "pendubot"])
+@pytest.mark.parametrize("name", ["appell-hamel", "passive-arm"])
 def test_tangents_span_the_kernel_of_the_gradients(name, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     x = model.start(**scene.start, guess=scene.guess).values

@@ -164,9 +164,7 @@ def assert_same_motion(run, name, w=None, tolerance=1e-9):
 
 
 WORDS = {
-    "renamed": {"prefix": "my_"},
     "permuted": {"order": "backwards"},
-    "millimetres": {"unit": 1e3},
     "kilometres": {"unit": 1e-3},
     "quasi-velocities": {"frame": True},
     "all at once": {"prefix": "my_", "order": "backwards", "unit": 1e3, "frame": True},
@@ -174,8 +172,10 @@ WORDS = {
 SIZES = {"crane": 3, "appell_hamel": 5, "mass_on_car": 2, "spiral": 2}
 
 
-@pytest.mark.parametrize("kind", WORDS)
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [*((name, "all at once") for name in SYSTEMS), ("crane", "kilometres"), ("appell_hamel", "permuted"), ("spiral", "quasi-velocities")],
+)
 def test_same_motion_and_report_in_other_words(name, kind):
     w = Words(**WORDS[kind] | ({"order": tuple(reversed(range(SIZES[name])))} if "order" in WORDS[kind] else {}))
     system = SYSTEMS[name](w)
@@ -210,8 +210,9 @@ def sums(q, residuals):
 EQUIVALENT = {"times 1e6": scaled(1e6), "times 1e-6": scaled(1e-6), "mixed": mixed, "sums": sums}
 
 
-@pytest.mark.parametrize("how", EQUIVALENT)
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    ("name", "how"), [("crane", "sums"), ("appell_hamel", "mixed"), ("mass_on_car", "times 1e6"), ("spiral", "times 1e-6")]
+)
 def test_equivalent_constraints_give_the_same_motion_and_report(name, how):
     system = SYSTEMS[name](Words(residuals=EQUIVALENT[how]))
     assert report(system[0]) == report(plain(name)[0])

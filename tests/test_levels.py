@@ -152,7 +152,7 @@ def derivative(order, t):
 # --- errors
 
 
-@pytest.mark.parametrize("k", [1e5, 2e5, 4e5])
+@pytest.mark.parametrize("k", [1e5, 4e5])
 def test_a_rigid_rope_errs_by_its_stretch(k):
     """h = y + m (y'' + g)/k; the winch's force differs by M m y''''/k."""
     t, m, M = instants(3.0), 100.0, 20.0

@@ -353,11 +353,10 @@ def test_the_mode_that_no_input_reaches_is_named_with_what_may_stay_unweighted(h
     assert max(np.abs(loop.residual[name][0]).max() for name in "XY") < 1e-5
 
 
-@pytest.mark.parametrize(("stiffness", "mode"), [(-4.0, {"y", "dy"}), (-0.5, {"y", "dy"})])
-def test_a_growing_mode_out_of_reach_is_named(stiffness, mode):
+def test_a_growing_mode_out_of_reach_is_named():
     with refused(sv.errors.ServoError, "force", unweighted=[]) as caught:
-        sv.lqr(*two_masses(stiffness))
-    assert set(caught.value.details["mode"]) == mode
+        sv.lqr(*two_masses(-0.5))
+    assert set(caught.value.details["mode"]) == {"y", "dy"}
 
 
 def test_a_mode_that_no_weight_sees_is_named(plan):

@@ -161,8 +161,7 @@ def narrow():
     return sv.derive(*specification)
 
 
-@pytest.mark.parametrize("middle", [0.3, 0.5117, 0.5123])
-@pytest.mark.parametrize("half", [1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize(("middle", "half"), [(0.3, 1e-2), (0.5123, 1e-5)])
 def test_a_narrow_unstable_range_is_found(middle, half, narrow):
     result = sv.minimum_phase(narrow.with_parameters(middle=middle, half=half), "w", (0.0, 1.0))
     assert [r.verdict for r in result.ranges] == ["stable", "unstable", "stable"]

@@ -115,9 +115,8 @@ def precise():
 @pytest.mark.parametrize(
     "options",
     [
-        {"method": "Taylor"}, {"method": "RadauIIA"}, {"method": "RK4"}, {"method": "DOP853"},
-        {"method": "DOP853", "drift": "project"},
-        {"method": "DOP853", "drift": 0.05}, {"method": "LSODA"}, {"accuracy": 1e-6},
+        {"method": "Taylor"}, {"method": "RadauIIA"}, {"method": "RK4", "drift": 0.05},
+        {"method": "DOP853", "drift": "project"}, {"method": "LSODA"}, {"accuracy": 1e-6},
     ],
     ids=lambda o: "-".join(map(str, o.values())),
 )  # fmt: skip
@@ -204,8 +203,7 @@ def least_norm_gap(rows, t, x, u, wish, weights):
     return np.abs(values.ravel() / scale).max(), np.abs(J.T @ multipliers - gradient).max()
 
 
-@pytest.mark.parametrize("weights", [None, {"motor": 3.0, "fan": 0.5}])
-def test_the_least_norm_by_the_derivative_array_of_the_plant(weights):
+def test_the_least_norm_by_the_derivative_array_of_the_plant():
     """A crane with a fan on its trolley's spring-borne mass: of all (u, u', u'') with φ^(4) = 0 the least u at a state.
 
     Independent of hidden rows: the plant's own derivatives, up to the fourth, and their KKT condition.
@@ -218,6 +216,7 @@ def test_the_least_norm_by_the_derivative_array_of_the_plant(weights):
     actuators = {"motor": x, "hoist": l, "fan": s - 0.5 * x, "tilt": s + 0.3 * l}
     mechanism = sv.Mechanism(q, gibbs=S, potential=U, actuators=actuators)
     residuals = {"X": load[0] - 0.3 * ca.sin(q.t), "Z": load[1] - 4 - 0.2 * ca.cos(q.t)}
+    weights = {"motor": 3.0, "fan": 0.5}
     program = sv.Program(residuals, weights=weights, toward={"fan": 2.0 - 0.4 * q.d(1)[3], "motor": 0.3 * q.t})
     model = sv.derive(mechanism, program, guess={"l": 4.0})
     assert model.free == 2
@@ -225,7 +224,7 @@ def test_the_least_norm_by_the_derivative_array_of_the_plant(weights):
     run = sv.simulate(model, start, (0.0, 0.6), t_eval=np.linspace(0.0, 0.6, 13))
     assert sv.verify(run).passed
     rows = plant_derivatives(mechanism, program, 4)
-    w = np.array([(weights or {}).get(name, 1.0) for name in actuators])
+    w = np.array([weights.get(name, 1.0) for name in actuators])
     for k in range(0, 13, 3):
         u = np.array([run[name][k] for name in actuators])
         wish = np.array([0.3 * run.t[k], 0.0, 2.0 - 0.4 * run["ds"][k], 0.0])
@@ -289,8 +288,9 @@ def single():
     return mechanism, sv.Program({"X": x - 2 * ca.cos(q.t), "Y": y - ca.sin(q.t)})
 
 
-@pytest.mark.parametrize("span", [(0.0, 7.0), (0.0, 3.0), (1.0, 9.0)])
-@pytest.mark.parametrize("machine", ["single", "wheel", "weights"])
+@pytest.mark.parametrize(
+    ("machine", "span"), [("single", (0.0, 7.0)), ("wheel", (0.0, 3.0)), ("weights", (1.0, 9.0))]
+)
 def test_exact_linearisation_goes_round_a_full_turn(machine, span):
     """Neither X nor Y sees the thrust all the way round: the thrust gets the integrators, from the plan's values on."""
     if machine == "single":

@@ -75,7 +75,7 @@ def counted(monkeypatch, tmp_path):
     return counts
 
 
-@pytest.mark.parametrize("which", ARMS)
+@pytest.mark.parametrize("which", ["ideal rates", "ideal accelerations", "least torque beside a bar", "millimetres"])
 def test_pivots_of_definite_matrices_give_the_same_motion(which):
     model, start = begun(which)
     other, p, x = with_diagonal_pivots(model), model.parameters, start.values
@@ -105,7 +105,7 @@ def test_error_dynamics_are_the_same_with_them(which):
 
 
 @pytest.mark.filterwarnings("ignore:Internal dynamics unstable")
-@pytest.mark.parametrize(("which", "method"), [("ideal", "DOP853"), ("ideal", "Taylor"), ("least torque", "DOP853")])
+@pytest.mark.parametrize(("which", "method"), [("ideal", "Taylor"), ("least torque", "DOP853")])
 def test_a_redundant_arm_changes_its_pivots_once(which, method, counted):
     model, start = begun(which)
     counted["derived"] = 0

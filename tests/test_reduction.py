@@ -236,8 +236,7 @@ CURVES = {  # points of the parameter u, and their heading
 }
 
 
-@pytest.mark.parametrize("speed", ["squared", "forward"])
-@pytest.mark.parametrize("kind", CURVES)
+@pytest.mark.parametrize(("kind", "speed"), [("wave", "squared"), ("parabola", "forward"), ("circle", "forward")])
 def test_a_geometric_path_beside_rolling_is_followed(kind, speed):
     """Rolling beside a path by its geometry leaves the speed times an angle; the angle is the hidden row."""
     q = sv.coordinates("x y psi u")
@@ -285,7 +284,7 @@ def steered(base=1.1):
 
 @pytest.mark.parametrize(
     ("scale", "factor", "by"),
-    [(1.0, 1.0, "actuators"), (1.0, 1.0, "ideal"), (1e-3, -3.0, "actuators"), (1e6, -3.0, "ideal")],
+    [(1.0, 1.0, "ideal"), (1e-3, -3.0, "actuators")],
 )
 def test_the_rate_of_a_constant_heading_of_a_moving_car_holds_its_steering_straight(scale, factor, by):
     """With v tan(δ)/a = 0 and v = c, δ = 0 and x is straight; every multiple of zero is zero, whatever it is beside."""

@@ -45,9 +45,6 @@ def internal_poles(model, state):
 
 # spirals -------------------------------------------------------------------------------------------------------------
 
-ORDERS = range(3, 13)
-
-
 @cache
 def spiral_model(order):
     return sv.derive(*spiral(order))
@@ -61,7 +58,7 @@ def spiral_start(order):
 
 @pytest.mark.parametrize(
     ("order", "method"),
-    [*((order, sv.methods.Adaptive(rtol=1e-10, atol=1e-12)) for order in ORDERS), (3, "RK4"), (8, "RK4")],
+    [*((order, sv.methods.Adaptive(rtol=1e-10, atol=1e-12)) for order in (3, 4, 12)), (8, "RK4")],
 )
 def test_spirals_end_at_one_radian(order, method):
     model, start = spiral_start(order)
@@ -75,7 +72,7 @@ def test_spirals_end_at_one_radian(order, method):
     assert np.hypot(run["dx"], run["dy"]) == pytest.approx(1.0, abs=1e-9)
 
 
-@pytest.mark.parametrize("terms", [6, 9, 12, 13])
+@pytest.mark.parametrize("terms", [6, 13])
 def test_spirals_by_series_of_which_every_third_coefficient_is_zero(terms):
     order = 4
     model, start = spiral_start(order)
@@ -332,7 +329,7 @@ def test_relative_degree_is_lost_at_an_angle(links, degrees):
     assert np.rad2deg(lost) == pytest.approx(degrees, abs=5e-5 if links == "unit" else 5e-7)
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau", "Taylor", "RK4"])
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK4"])
 def test_the_unstable_arm_stops_where_the_relative_degree_is_lost(method):
     model = arm("unit")
     options = {"step": 1e-3} if method == "RK4" else {}

@@ -1,4 +1,4 @@
-"""The gallery in docs: its pages have the code, the facts and what is printed of each scene, and its pictures."""
+"""The gallery in docs: its pages have the code, the facts and what is printed of each scene, its number and its pictures."""
 
 import re
 import runpy
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gallery_numbers import ENDS, NUMBERS, quoted
 
 from servoctl.gallery import gallery
 
@@ -23,12 +24,18 @@ def told(page):
 
 
 @pytest.mark.parametrize("name", gallery)
+@pytest.mark.usefixtures("uncompiled")
 def test_the_page_of_a_scene_is_what_its_code_says_and_prints(name):
-    written, _ = WRITER["scene_page"](name)
+    written, run = WRITER["scene_page"](name)
     (words, numbers), (shown, stored) = told(written), told((DOCS / "gallery" / f"{name}.md").read_text(encoding="utf-8"))
     assert words == shown
     for found, expected in zip(numbers, stored, strict=True):
         assert found == pytest.approx(expected, rel=1e-3, abs=1e-3 * max(abs(expected), default=0.0))
+    assert ("Verification: passed" in written) == (name not in ENDS)
+    if name not in ENDS:
+        with np.errstate(all="ignore"):
+            measured, number = NUMBERS[name](run)
+        assert measured == pytest.approx(number, rel=2e-5) and quoted(name, number)
 
 
 def test_the_page_of_the_gallery_leads_to_every_scene():

@@ -7,7 +7,7 @@ import closed_forms as cf
 import numpy as np
 import pytest
 from refusals import refused, warned
-from scenes import CERTIFIED
+from scenes import KINDS
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
@@ -71,8 +71,10 @@ def assert_told(error, at, within):
     assert np.abs(forward - 0.5 * run["dphi"])[before].max() < 0.05
 
 
-@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
-@pytest.mark.parametrize(("method", "drift"), [(m, d) for m in ADAPTIVE for d in drifts(m)])
+@pytest.mark.parametrize(
+    ("method", "drift", "rtol"),
+    [*((m, d, 1e-8) for m in ADAPTIVE for d in drifts(m)), ("DOP853", None, 1e-6), ("DOP853", None, 1e-10)],
+)
 def test_adaptive_methods_stop_when_the_wheel_stops(method, drift, rtol, squared, on_the_right_branch):
     error = stopped(squared, on_the_right_branch, (0.0, 2.0), method=method, drift=drift, rtol=rtol)
     assert_told(error, cf.WHEEL_STOPS, 1e-3)
@@ -104,7 +106,7 @@ def test_the_linear_program_passes(method, gallery_model):
     assert run["dphi"][-1] == pytest.approx(cf.APPELL_HAMEL_STATES[2.0][5], abs=1e-6)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["DOP853", "LSODA", "Taylor", "RK4"])
 def test_a_wheel_that_starts_backwards_stops_later(method, squared):
     start = squared.start(guess={"dx": -0.5}, dphi=-1.0, **ZERO)
     run = sv.simulate(squared, start, (0.0, 1.0), method=as_method(method, **tolerances(method)))
@@ -162,8 +164,13 @@ def test_a_horizontal_force_ends_with_the_fall(method, drift, rtol, gallery_mode
 SINGULAR = ("appell-hamel-squared", "constant-speed-horizontal")
 
 
-@pytest.mark.parametrize("method", ["RK45", "DOP853", "Radau", "LSODA", "Taylor", "RK4"])
-@pytest.mark.parametrize("name", [name for name in CERTIFIED if name not in SINGULAR])
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *((name, method) for name in KINDS if name not in SINGULAR for method in ("DOP853", "Taylor")),
+        *(("mass-on-car", method) for method in ("RK45", "Radau", "LSODA", "RK4")),
+    ],
+)
 def test_no_false_alarm(name, method, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     start = model.start(**scene.start, guess=scene.guess)
@@ -242,8 +249,8 @@ def precise(method):
 @pytest.mark.parametrize(
     ("kind", "method"),
     [
-        *(("equation", method) for method in ("DOP853", "Radau", "LSODA", "Taylor", "RK4")),
-        *(("curvature", method) for method in ("DOP853", "RK45", "RK8")),
+        *(("equation", method) for method in ("DOP853", "LSODA", "Taylor")),
+        *(("curvature", method) for method in ("Radau", "RK8")),
     ],
 )
 def test_a_particle_goes_round_and_round(kind, method, derived):
@@ -261,8 +268,7 @@ def derives_again(patch):
     patch.setattr("servoctl.methods.monitor.reordered_at", lambda *_: None)
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Taylor"])
-@pytest.mark.parametrize("make", ["equation", "curvature"])
+@pytest.mark.parametrize(("make", "method"), [("equation", "DOP853"), ("curvature", "Taylor")])
 def test_rows_derived_again_lead_on(make, method, derived, monkeypatch):
     derives_again(monkeypatch)
     model = derived(on_a_circle, make)
@@ -281,7 +287,7 @@ def test_long_steps_change_pivots_on_the_way_back_too(derived, monkeypatch):
     assert np.hypot(run["x"] - np.cos(run.t), run["y"] - np.sin(run.t)).max() < 1e-9
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau", "LSODA", "Taylor", "RK4"])
+@pytest.mark.parametrize("method", ["LSODA", "Taylor", "RK4"])
 def test_a_pendulum_goes_over_the_top(method, derived):
     model = derived(pendulum_on_a_cart)
     start = model.start(s=0.0, ds=0.0, x=0.0, y=-1.0, dx=7.0)
@@ -296,7 +302,7 @@ def test_a_pendulum_goes_over_the_top(method, derived):
     assert np.abs(run["force"]).max() < 80.0 and sv.verify(run, segments=4).numbers["balance"] < 1e-11
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Radau", "LSODA", "Taylor", "RK4"])
+@pytest.mark.parametrize("method", ["Radau", "Taylor", "RK4"])
 def test_a_driven_pendulum_turns_by_more_than_360_degrees(method, derived):
     model = derived(driven_pendulum)
     start = model.start(x=1.0, y=0.0)
@@ -360,8 +366,10 @@ def lifted(name, start=0.0):
     return model, model.start(b=start)
 
 
-@pytest.mark.parametrize("method", [None, "RK4", "DOP853", "Taylor", "RadauIIA"])
-@pytest.mark.parametrize("name", LEVERS)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [*((name, None) for name in LEVERS), *(("lever of both", method) for method in ("RK4", "DOP853", "RadauIIA"))],
+)
 def test_a_motion_of_all_coordinates_stops_where_an_actuator_has_no_lever(name, method):
     """The accelerations are finite there, and the force 1/lever is not."""
     dead = LEVERS[name][1]

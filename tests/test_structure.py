@@ -154,9 +154,9 @@ def test_the_essential_order_is_the_class_that_a_path_needs():
 # units and margins ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("factor", [1e-9, 1e9])
 @pytest.mark.parametrize(
-    "name", ["two-cars", "overhead-crane", "winch-crane-redundant", "mass-on-car", "vtol", "passive-arm"]
+    ("name", "factor"),
+    [("overhead-crane", 1e-9), ("winch-crane-redundant", 1e9), ("vtol", 1e-9), ("passive-arm", 1e9)],
 )
 def test_the_structure_does_not_depend_on_units(name, factor):
     mechanism, program = gallery[name].build()

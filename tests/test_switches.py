@@ -103,7 +103,7 @@ def test_a_stop_is_met_and_left(method, drift):
     assert run.knots == pytest.approx([0.1, 0.1 + np.pi / 20], abs=1e-8)
 
 
-@pytest.mark.parametrize("accuracy", [1e-4, 1e-6, 1e-9])
+@pytest.mark.parametrize("accuracy", [1e-4, 1e-9])
 def test_an_accuracy_holds_across_switches(accuracy):
     model, start = beside(lambda t, y, dy: -9 * y - 2 * ca.sign(dy), y=2.0, dy=0.0)
     run = sv.simulate(model, start, (0.0, 2.8), accuracy=accuracy)
@@ -150,8 +150,10 @@ VARIANTS = {  # force(t, y, dy) with CasADi, the same on one side, the switch, s
 }
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RadauIIA", "RK8", "Radau"])
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [*((name, "Taylor") for name in VARIANTS), *(("an edge that moves", method) for method in ("DOP853", "RadauIIA", "RK8", "Radau"))],
+)
 def test_other_switches_agree_with_events(name, method):
     force, rates, switch, (y0, dy0, side, end) = VARIANTS[name]
     model, start = beside(force, y=y0, dy=dy0)
@@ -352,9 +354,10 @@ ANGLES = {
 }
 
 
-@pytest.mark.parametrize("name", ANGLES)
-@pytest.mark.parametrize("factor", [1.0, -2.0, 0.5], ids=str)
-@pytest.mark.parametrize("samples", [5, 101])
+@pytest.mark.parametrize(
+    ("name", "factor", "samples"),
+    [*((name, -2.0, 5) for name in ANGLES), ("from far beyond", 1.0, 101), ("with a jump of its own", 0.5, 101)],
+)
 def test_angles_count_up_to_whole_turns(name, factor, samples):
     t = ca.SX.sym("t")
     angle = ca.Function("angle", [t], [ANGLES[name](t)])
@@ -403,7 +406,7 @@ def test_rates_of_powers_have_no_switches():
     assert switching(sv.derive(mechanism, sv.Program({"bend": bend}, by="ideal"))) is None
 
 
-@pytest.mark.parametrize("method", ["DOP853", "RK45", "LSODA", "RadauIIA", "Taylor"])
+@pytest.mark.parametrize("method", ["RK45", "LSODA", "RadauIIA", "Taylor"])
 def test_a_grazing_contact_is_found(method):
     """A ball that is thrown up by 0.5 m touches a stiff ceiling at 0.4999 m for some milliseconds."""
     q = sv.coordinates("x y")
@@ -467,15 +470,21 @@ def narrow_reference(name):
     return state
 
 
-@pytest.mark.parametrize("method", ADAPTIVE)
-@pytest.mark.parametrize("name", NARROW)
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        *((name, "Taylor") for name in NARROW),
+        *(("a bump in time", method) for method in ADAPTIVE if method != "Taylor"),
+        *((name, "DOP853") for name in ("a bump of 30 us", "a bump in what is free", "backwards")),
+    ],
+)
 def test_no_method_steps_over_a_narrow_force(name, method):
     force, start, span = NARROW[name]
     run = sv.simulate(*pushed(force, *start), span, method, t_eval=span)
     assert [run["y"][-1], run["dy"][-1]] == pytest.approx(narrow_reference(name), abs=2e-6)
 
 
-@pytest.mark.parametrize("name", NARROW)
+@pytest.mark.parametrize("name", ["a bump in place", "a bump in what is free", "a pulse of two blends"])
 def test_intervals_between_samples_hide_no_flank(name):
     """LSODA between two samples alone, without those of the verdict on growth."""
     force, start, span = NARROW[name]
@@ -502,9 +511,10 @@ STEEP = {  # of k (t - 1): as the designer writes them, where exp leaves the ran
 }
 
 
-@pytest.mark.parametrize("slope", [500.0, 2e3, 1e4, 1e5])
-@pytest.mark.parametrize("method", ["Taylor", "DOP853"])
-@pytest.mark.parametrize("name", STEEP)
+@pytest.mark.parametrize(
+    ("name", "method", "slope"),
+    [*((name, "Taylor", 1e5) for name in STEEP), *((name, "DOP853", 2e3) for name in STEEP), ("logistic", "Taylor", 500.0)],
+)
 def test_steep_blends_neither_overflow_nor_are_stepped_over(name, method, slope):
     """y'' = f - y from y = 0.3 at rest: y(2) = 0.3 cos 2 + the integral of f(s) sin(2 - s)."""
     symbolic, numeric = STEEP[name]
@@ -556,11 +566,18 @@ PULSES = {  # of time alone, or of the place x = t: their impulse is 1, about t 
 }
 
 
-@pytest.mark.parametrize("of", ["time", "place"])
-@pytest.mark.parametrize("name", PULSES)
-def test_two_switches_within_a_step_are_both_met(name, of):
+@pytest.mark.parametrize(
+    ("name", "of", "methods"),
+    [
+        ("by both sides", "place", METHODS),
+        ("by fabs", "time", ("DOP853", "Taylor")),
+        ("by a square", "place", ("DOP853", "Taylor")),
+        ("of 20 us by a square", "time", ("LSODA", "Taylor")),
+    ],
+)
+def test_two_switches_within_a_step_are_both_met(name, of, methods):
     pulse = PULSES[name]
-    for method in METHODS:
+    for method in methods:
         model, start = pushed(lambda t, x, y: pulse(t if of == "time" else x), 0.0, 0.0)
         run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
         middle = 1.00037 if "square" in name else 1.0

@@ -330,8 +330,10 @@ def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, 
     assert (tmp_path / "here" / "tradeoff.csv").exists() and (tmp_path / "here" / "report.txt").exists()
 
 
-@pytest.mark.parametrize("option", ["--limit", "--error", "--seconds"])
-@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "x"])
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--limit", "0"), ("--error", "-1"), ("--seconds", "nan"), ("--limit", "inf"), ("--error", "x")],
+)
 def test_the_command_refuses_what_is_no_positive_number_before_it_measures(option, value, capsys):
     with pytest.raises(SystemExit):
         main(["tradeoff", "appell-hamel", f"{option}={value}"])

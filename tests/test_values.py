@@ -20,7 +20,7 @@ from servoctl.model.equations import signal_groups
 from servoctl.model.variants import derived_near
 from servoctl.values import frozen
 
-SCENES = ("overhead-crane", "appell-hamel", "crane-3d", "constant-speed", "three-cars", "wheeled-robot")
+SCENES = ("overhead-crane", "appell-hamel", "constant-speed", "wheeled-robot")
 
 
 def again(value):

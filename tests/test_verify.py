@@ -209,8 +209,7 @@ def test_pivots_that_vanish_between_samples_are_replaced(samples):
     assert sv.verify(run).passed
 
 
-@pytest.mark.parametrize("order", [2, 3, 4])
-@pytest.mark.parametrize("by", ["actuators", "ideal"])
+@pytest.mark.parametrize(("order", "by"), [(2, "ideal"), (3, "actuators"), (4, "ideal")])
 def test_a_row_above_the_order_of_the_motion_has_a_residual(order, by):
     q = sv.coordinates("x y z")
     x, y, z = q
@@ -383,9 +382,10 @@ def turning():
     return model, model.start(dx=1.0, x=0.0, y=0.0), (0.0, 10.0)
 
 
-@pytest.mark.parametrize("samples", [None, 101, 11])
-@pytest.mark.parametrize("method", ["DOP853", "Taylor", "RK4"])
-@pytest.mark.parametrize("scene", [rubbed, turning])
+@pytest.mark.parametrize(
+    ("scene", "method", "samples"),
+    [(rubbed, "DOP853", None), (rubbed, "RK4", 11), (turning, "Taylor", 101)],
+)
 def test_runs_across_switches_pass(scene, method, samples, tmp_path):
     model, start, span = scene()
     times = None if samples is None else np.linspace(*span, samples)

@@ -272,14 +272,21 @@ def scene(name):
     return model, span, start, moved(f, span, start)
 
 
-@pytest.mark.parametrize("name", [*BLENDS, *FLAT])
-@pytest.mark.parametrize("method", [None, "Taylor", {"accuracy": 1e-7}], ids=["default", "Taylor", "accuracy"])
-def test_what_comes_alive_later_or_elsewhere_acts(name, method):
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        *((name, {}) for name in (*BLENDS, *FLAT)),
+        ("cam with dwell", {"method": "Taylor"}),
+        ("root far away in time", {"method": "Taylor"}),
+        ("narrow bump", {"accuracy": 1e-7}),
+    ],
+    ids=str,
+)
+def test_what_comes_alive_later_or_elsewhere_acts(name, settings):
     model, span, start, end = scene(name)
-    settings = method if isinstance(method, dict) else {"method": method}
     run = sv.simulate(model, model.start(x=start[0], dx=start[1]), span, **settings)
     assert [run["x"][-1], run["dx"][-1]] == pytest.approx(end, abs=2e-6)
-    assert np.abs(run.residual["Y"][0]).max() < (5e-7 if method == "Taylor" else 1e-7)
+    assert np.abs(run.residual["Y"][0]).max() < (5e-7 if "method" in settings else 1e-7)
 
 
 @functools.cache
@@ -289,7 +296,7 @@ def resting():
     return model, moved(f, (33.0, 40.0), (0.0, 0.0))
 
 
-@pytest.mark.parametrize("method", ["DOP853", "RK45", "Radau", "LSODA", "Taylor"])
+@pytest.mark.parametrize("method", ["DOP853", "LSODA", "Taylor"])
 def test_a_bump_while_the_motion_rests_is_not_stepped_over(method):
     """The steps of a motion at rest are the longest; the bump, 0.03 s of 40 s, is narrower than any of them."""
     model, end = resting()

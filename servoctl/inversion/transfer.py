@@ -198,7 +198,7 @@ class Transfer:
             return None
         with np.errstate(all="ignore"):
             _, (A,), _, (tangent,) = entries.local(np.array([t]), x[:, None])
-        if not np.isfinite(A).all():
+        if A.size == 0 or not np.isfinite(A).all():
             return None
         modes = End(t, x, A.T if of_start else A, entries.size[entries.free]).left_space(unstable=True)
         return (entries, tangent, modes) if len(modes) else None

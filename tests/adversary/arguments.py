@@ -28,16 +28,15 @@ WORDS = ("accepted", "refused")
 MOST_CALLS = 20_000_000  # of functions, within a call before it counts as hanging
 
 ODD = {
-    "None": None, "text": "abc", "no text": "", "a number in text": "1.0", "NUL": "a\0b", "a surrogate": "\ud800",
-    "bytes": b"x", "[]": [], "()": (), "{}": {}, "0": 0, "-1": -1, "1.5": 1.5, "2**63": 2**63, "10**400": 10**400,
-    "1e-300": 1e-300, "1e300": 1e300, "NaN": math.nan, "inf": math.inf, "1j": 1j, "True": True,
-    "complex64": np.complex64(2 + 3j), "longdouble": np.longdouble(0.1),
-    "(2, 3) array": np.ones((2, 3)), "array of NaN": np.array([np.nan]), "array of text": np.array(["a"]),
-    "complex array": np.array([1j, 2.0]), "uneven": [[1, 2], [3]], "[None]": [None], "['a']": ["a"], "{1}": {1},
-    "MX": ca.MX.sym("x"), "SX": ca.SX.sym("zz"), "SX of NaN": ca.SX(math.nan), "DM": ca.DM([1, 2]),
-    "function": lambda *_: 1, "function of nothing": lambda: 1, "object": object(), "type": int,
-    "{'x': None}": {"x": None}, "{'x': 1e300}": {"x": 1e300}, "{'zz': 1}": {"zz": 1.0}, "{None: 1}": {None: 1.0},
+    "None": None, "text": "abc", "a number in text": "1.0", "NUL": "a\0b", "a surrogate": "\ud800", "bytes": b"x",
+    "[]": [], "0": 0, "-1": -1, "2**63": 2**63, "10**400": 10**400, "1e-300": 1e-300, "1e300": 1e300, "NaN": math.nan,
+    "inf": math.inf, "1j": 1j, "True": True, "complex64": np.complex64(2 + 3j), "longdouble": np.longdouble(0.1),
+    "(2, 3) array": np.ones((2, 3)), "array of text": np.array(["a"]), "complex array": np.array([1j, 2.0]),
+    "uneven": [[1, 2], [3]], "['a']": ["a"], "{1}": {1}, "MX": ca.MX.sym("x"), "SX": ca.SX.sym("zz"), "DM": ca.DM([1, 2]),
+    "function": lambda *_: 1, "type": int, "{'x': 1e300}": {"x": 1e300}, "{'zz': 1}": {"zz": 1.0}, "{None: 1}": {None: 1.0},
 }  # fmt: skip
+SLOW = ("relaxed", "fastest", "tradeoff", "figures.", "map.plot", "computed", "minimum_phase")  # how the names of calls begin that solve
+FEW = ("None", "text", "1e-300", "NaN", "1j", "(2, 3) array", "['a']", "SX", "function", "{'zz': 1}")  # for them
 
 
 def point():
@@ -414,9 +413,9 @@ def fuzz(only=()):
         good = outcome(call, arguments)
         assert good == "accepted", f"{name} with good arguments: {good}"
         for argument in arguments:
-            for odd, value in ODD.items():
+            for odd in FEW if name.startswith(SLOW) else ODD:
                 with contextlib.redirect_stdout(None):
-                    outcomes[name, argument, odd] = outcome(call, {**arguments, argument: value})
+                    outcomes[name, argument, odd] = outcome(call, {**arguments, argument: ODD[odd]})
     for name, call in commands().items():
         if not only or any(word in name for word in only):
             outcomes |= {(name, "text", repr(text)[:20]): outcome(call, {"text": text}) for text in TEXTS}

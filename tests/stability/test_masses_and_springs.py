@@ -57,7 +57,7 @@ def test_an_internal_motion_bears_heavy_masses(name, ratio, slider):
     assert relative(run["force"], reference["force"]) < 1e-8
 
 
-@pytest.mark.parametrize("mass", [1e-4, 1e-8])
+@pytest.mark.parametrize("mass", [1e-8])
 def test_a_sliding_mass_that_hardly_weighs_follows_its_spring(mass, slider):
     """Its fast mode, -d/(m sin²α), has died out: d s' + k s = -m cosα z'' but for terms of the size of the mass."""
     model = slider.with_parameters(m_2=mass)
@@ -127,7 +127,7 @@ def test_a_guide_that_is_level_up_to_rounding_is_level(how, alpha, slider):
     assert relative(run["s"], level["s"]) < 1e-9 and relative(run["force"], level["force"]) < 1e-9
 
 
-@pytest.mark.parametrize("alpha", [1e-4, 1e-3])
+@pytest.mark.parametrize("alpha", [1e-3])
 def test_a_guide_that_is_hardly_inclined_follows_the_level_one(alpha, slider):
     """The fast mode -d/(m sin²α) has died out; s differs from the level guide's by terms in sin²α."""
     model = slider.with_parameters(alpha=alpha)
@@ -138,7 +138,7 @@ def test_a_guide_that_is_hardly_inclined_follows_the_level_one(alpha, slider):
     assert relative(run["force"], level["force"]) < 200 * alpha**2 + 5e-11 / alpha**2  # s weighs k/sin²α
 
 
-@pytest.mark.parametrize("alpha", [0.1, 1.0, np.pi / 2 - 1e-4, np.pi / 2 - 1e-8, np.pi / 2])
+@pytest.mark.parametrize("alpha", [0.1, np.pi / 2 - 1e-8, np.pi / 2])
 def test_a_guide_of_any_inclination(alpha, slider):
     model = slider.with_parameters(alpha=alpha)
     assert model.free == 2
@@ -157,9 +157,10 @@ BARRIERS = {  # of height 1 and width 1 about 0
 }
 
 
-@pytest.mark.parametrize("method", [None, "DOP853", "RadauIIA"])
-@pytest.mark.parametrize("width", [1e-4, 1e-6])
-@pytest.mark.parametrize("name", BARRIERS)
+@pytest.mark.parametrize(
+    ("name", "width", "method"),
+    [*((name, 1e-6, None) for name in BARRIERS), ("Gauss", 1e-4, "DOP853"), ("plateau", 1e-4, "RadauIIA")],
+)
 def test_a_narrow_barrier_reflects(name, width, method):
     """A mass of energy 1/2 before a barrier of 1 returns, however narrow that is: its force is zero on its top."""
     q = sv.coordinates("x y")

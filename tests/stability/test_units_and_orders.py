@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import pendulum
 from refusals import refused
-from scenes import CERTIFIED
+from scenes import KINDS
 from units import in_units, scale
 
 import servoctl as sv
@@ -18,9 +18,8 @@ UNITS = (1e-6, 1e6)  # units per metre: megametres to micrometres
 LENGTHS = {"a": 1, "b": 1, "rho": 1, "g": 1, "I_x": 2, "I_y": 2}  # of the Appell-Hamel mechanism, by power of length
 
 
-@pytest.mark.parametrize("unit", UNITS)
 @pytest.mark.parametrize(
-    ("method", "drift"), [("DOP853", "project"), ("Taylor", "project"), ("RK4", None)]
+    ("method", "drift", "unit"), [("DOP853", "project", 1e-6), ("Taylor", "project", 1e6), ("RK4", None, 1e-6)]
 )
 def test_appell_hamel_in_any_unit(method, drift, unit, gallery_model):
     model = gallery_model("appell-hamel")
@@ -65,8 +64,7 @@ def test_a_crane_in_any_unit(unit):
         assert run[name] / unit == pytest.approx(reference[name], abs=1e-9 * np.abs(reference[name]).max())
 
 
-@pytest.mark.parametrize("guess", [True, False])
-@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1e6])
+@pytest.mark.parametrize(("unit", "guess"), [(1e-6, True), (1e6, False)])
 def test_a_pendulum_goes_round_in_any_unit(unit, guess, c_compiler):
     """Pivots change where the rod passes a horizontal or a vertical, however long it is."""
     model = pendulum(unit, guess)
@@ -95,12 +93,11 @@ def rod(length, guess=None):
 ROD_STARTS = [{"x": 1.0, "dy": 0.0}, {"x": 1.0, "dy": 0.5}, {"y": 0.0, "dy": 0.0}, {"x": 0.0, "dx": 7.0}]
 
 
-@pytest.mark.parametrize("start", ROD_STARTS, ids=str)
-@pytest.mark.parametrize("guessed", [False, True])
+@pytest.mark.parametrize(("start", "guessed"), [*zip(ROD_STARTS, (False, True, False, True), strict=True)], ids=str)
 def test_the_rank_of_a_rod_does_not_depend_on_its_length(start, guessed):
     """Rows of (3.18) hold quotients of pivots, which go to infinity each time the rod is level or upright."""
     ends = []
-    for length in (1.0, 100.0, 1e3, 1e-3, 1e6):
+    for length in (1.0, 1e-3, 1e6):
         model = rod(length, {"y": -length} if guessed else None)
         below = {"x": 0.5 * length, "y": -0.5 * length}
         state = model.start(guess=below, **{name: value * length for name, value in start.items()})
@@ -112,8 +109,7 @@ def test_the_rank_of_a_rod_does_not_depend_on_its_length(start, guessed):
         assert end == pytest.approx(ends[0], abs=1e-6)
 
 
-@pytest.mark.parametrize("length", [1e-9, 1e-6, 1e6])
-@pytest.mark.parametrize("method", ["DOP853", "LSODA", "Taylor", "RadauIIA"])
+@pytest.mark.parametrize(("method", "length"), [("DOP853", 1e-9), ("LSODA", 1e-6), ("Taylor", 1e6), ("RadauIIA", 1e-9)])
 def test_motions_of_any_size_have_the_same_relative_error(method, length):
     """At the defaults: absolute tolerances follow the size of the motion."""
     runs = []
@@ -150,15 +146,13 @@ def oscillator():
     return chained(lambda t: 0.3 * ca.sin(2.0 * t))
 
 
-SCALES = [  # units per metre, per kilogram and per second
-    (1e6, 1.0, 1.0), (1e-6, 1.0, 1.0), (1.0, 1e3, 1.0), (1e6, 1e3, 1.0), (1e-6, 1e-3, 1.0),
-    (1.0, 1.0, 1e-6), (1.0, 1.0, 1e-2), (1.0, 1.0, 1e6), (1e3, 1e-3, 1e3),
-]  # fmt: skip
+SCALES = [(1e6, 1e3, 1.0), (1e-6, 1e-3, 1.0), (1.0, 1.0, 1e-6), (1.0, 1.0, 1e6)]  # units per metre, kilogram and second
 # Pivots are chosen again at these states, with speeds of 1e-6 or at rest, and fail: refused, not wrong.
-REFUSED = {("spiral", 1e-6, 1.0, 1.0), ("spiral", 1e-6, 1e-3, 1.0), ("spiral", 1.0, 1.0, 1e6)}
+REFUSED = {("spiral", 1e-6, 1e-3, 1.0), ("spiral", 1.0, 1.0, 1e6)}
 
 
-@pytest.mark.parametrize("name", [*CERTIFIED, "bicycle", "furuta-pendulum", "hopper", "reaction-wheels", "trailers"])
+@pytest.mark.parametrize("name", [*KINDS, "hopper", "reaction-wheels", "trailers"])
+@pytest.mark.usefixtures("uncompiled")
 def test_a_scene_moves_alike_in_any_unit(name):
     """From micrometres to megametres, grams to tonnes, microseconds to megaseconds, along the whole motion."""
     scene = gallery[name]
@@ -300,7 +294,7 @@ def test_poles_beyond_it_are_told(speed, gallery_model):
     assert "poles" in str(caught.value)
 
 
-@pytest.mark.parametrize("speed", [1e2, 1e4])
+@pytest.mark.parametrize("speed", [1e4])
 def test_an_implicit_method_bears_any_poles(speed, gallery_model):
     model = gallery_model("appell-hamel")
     start = model.start(x=0.0, y=0.0, z=0.0, phi=0.0, theta=0.0, dphi=1.0, dtheta=2.0)
