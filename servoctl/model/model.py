@@ -243,8 +243,8 @@ class Model(Detailed):
         """The reduction of another model with the numbers and paths of this one."""
         return Model(other.reduction, other._store, self.parameters, self._knots, functions, variants, self.paths)
 
-    @cached_property
-    def _followed(self):
+    def require_paths(self):
+        """Refuse a model with references that have no path yet."""
         if missing := [name for name, path in self.paths.items() if path is None]:
             raise SpecificationError(
                 f"No path was given for {', '.join(missing)}.",
@@ -252,6 +252,10 @@ class Model(Detailed):
                 do=f"Write model.with_references({', '.join(f'{name}=...' for name in missing)}).",
                 missing=missing,
             )
+
+    @cached_property
+    def _followed(self):
+        self.require_paths()
         return Followed([path.held() for path in self.paths.values()])
 
     @cached_property
