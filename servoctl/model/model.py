@@ -18,6 +18,7 @@ from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
 from servoctl.model.jets import jet_names_to
 from servoctl.model.report import describe, warn_of_products
+from servoctl.model.points import with_place
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
@@ -169,7 +170,8 @@ class Model(Detailed):
             return NotImplemented
         known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
         same = known and place_of(self) == place_of(other)
-        return self is other or (same and np.array_equal(self.parameters, other.parameters))
+        same = same and np.array_equal(self.parameters, other.parameters)
+        return self is other or (same and self.paths == other.paths)
 
     def __hash__(self):
         return hash(self._store.fingerprint)
@@ -261,7 +263,11 @@ class Model(Detailed):
     @cached_property
     def p(self):
         """The parameters of compiled functions: those of the model, after the place of the paths that it follows."""
-        return read_only(np.append(self._followed.address, self.parameters)) if self.paths else self.parameters
+        return read_only(self.p_with(self.parameters)) if self.paths else self.parameters
+
+    def p_with(self, parameters):
+        """The same with other parameters (n_p,) or (n_p, N)."""
+        return with_place((self._followed.address,) if self.paths else (), parameters)
 
     def instants(self, t):
         """Instants (N, 1 + R) of times (N,) [s]: with the jets of the paths that are followed there."""

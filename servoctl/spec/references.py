@@ -123,6 +123,15 @@ def function_of(q, names, name, x, p, *outputs, jets="r"):
     return ca.Function(name, [*inputs.values()], outputs, [*inputs], [f"y{i or ''}" for i in range(len(outputs))])
 
 
+def applied(q, names, f, t, x, p):
+    """The output of a function of a model at symbols, with those of the references; p has the parameters alone."""
+    jets = []
+    if f.n_in() > 3:
+        levels = range(f.size2_in(3))
+        jets = [ca.horzcat(*(ca.vertcat(*(q.family.jet(name, k) for name in names)) for k in levels))]
+    return f.call([t, x, ca.vertcat(0, p) if names else p, *jets])[0]
+
+
 def followed_path(name, path):
     """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
     path = None if path is None else as_path(path)
