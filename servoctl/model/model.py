@@ -17,8 +17,8 @@ from servoctl.jets.tape import JETS, REAL
 from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
 from servoctl.model.jets import jet_names_to
-from servoctl.model.report import describe, warn_of_products
 from servoctl.model.points import with_place
+from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
@@ -33,7 +33,7 @@ from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.spec.references import followed_path
+from servoctl.spec.references import followed_path, required_paths
 from servoctl.values import evenly, read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
@@ -169,9 +169,8 @@ class Model(Detailed):
         if not isinstance(other, Model):
             return NotImplemented
         known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
-        same = known and place_of(self) == place_of(other)
-        same = same and np.array_equal(self.parameters, other.parameters)
-        return self is other or (same and self.paths == other.paths)
+        same = known and place_of(self) == place_of(other) and self.paths == other.paths
+        return self is other or (same and np.array_equal(self.parameters, other.parameters))
 
     def __hash__(self):
         return hash(self._store.fingerprint)
@@ -245,20 +244,9 @@ class Model(Detailed):
         """The reduction of another model with the numbers and paths of this one."""
         return Model(other.reduction, other._store, self.parameters, self._knots, functions, variants, self.paths)
 
-    def require_paths(self):
-        """Refuse a model with references that have no path yet."""
-        if missing := [name for name, path in self.paths.items() if path is None]:
-            raise SpecificationError(
-                f"No path was given for {', '.join(missing)}.",
-                "A motion follows a path for each reference of the program.",
-                do=f"Write model.with_references({', '.join(f'{name}=...' for name in missing)}).",
-                missing=missing,
-            )
-
     @cached_property
     def _followed(self):
-        self.require_paths()
-        return Followed([path.held() for path in self.paths.values()])
+        return Followed([path.held() for path in required_paths(self.paths).values()])
 
     @cached_property
     def p(self):

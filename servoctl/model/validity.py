@@ -164,8 +164,8 @@ def _criterion(model, varied):
     """
     known, equations = model.once("quantities", lambda: quantities(model.equations)), model.equations
     t, x, p, n, n_x = equations.q.t, equations.state, equations.parameters, model.n, len(model.state_names)
-    rates = equations.applied(model.function("ode").expression, t, x, p)
-    y = equations.applied(known.function.expression, t, ca.vertcat(x, rates[n_x - n : n_x]), p)
+    rates = equations.called(model.function("ode").expression, x, p)
+    y = equations.called(known.function.expression, ca.vertcat(x, rates[n_x - n : n_x]), p)
     value, size = ca.vertsplit(y, y.numel() // 2)
     depend = [True] * y.numel() if varied is None else ca.which_depends(y, p[varied], 1, True) if varied else []
     some = {i % value.numel() for i, depends in enumerate(depend) if depends}
@@ -204,7 +204,7 @@ def _on_manifold(model, t, x, p):
 def _manifold(model, t, x, p):
     """Expressions of the state after a step of `least_steps` to the manifold, and whether it is there before."""
     m, sizes = len(invariant_names(model)), _sizes_of(model)
-    y = model.equations.applied(model.function("invariants").expression, t, x, p)
+    y = model.equations.called(model.function("invariants").expression, x, p)
     residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, -1))
     scales = ca.sqrt(jacobian**2 @ (sizes + ca.fabs(x)) ** 2)
     off = [ca.fabs(residual[i]) <= ON_MANIFOLD * ca.if_else(scales[i] > 0, scales[i], 1) for i in range(m)]
