@@ -527,7 +527,7 @@ def _rates(model, run, samples, t, x):
     y = np.empty_like(x)
     for variant, inside in _by_variant(model, run, samples):
         f = variant.function("ode").interpreted
-        y[:, inside] = _grid(f, t[inside], x[:, inside], variant.parameters)[: len(x)]
+        y[:, inside] = _grid(f, t[inside], x[:, inside], variant.p)[: len(x)]
     return y
 
 

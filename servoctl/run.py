@@ -370,7 +370,7 @@ class Run(Sampled, Value):
         variant = self.variant(last)
         if variant is not self.variant(first) and not variant.flat:
             n_x, n, column = len(variant.state_names), variant.n, int(i > j)
-            rates = variant.function("ode")(self.t[first], jets[:n_x, column], variant.parameters)
+            rates = variant.function("ode")(self.t[first], jets[:n_x, column], variant.p)
             jets[n_x : n_x + n, column] = rates[n_x - n : n_x]
         return jets
 

@@ -80,7 +80,7 @@ class Dialect:
     common: bool = False  # whether all lanes share p, an array of double
     linkage: str = ""  # of the function and its chunks; without one, chunks are static and not inlined
     exact: bool = False  # whether operations are those of CasADi, one by one, without shared reciprocals
-    whole: bool = False  # whether the text holds the numbers of large tables; else loading its library sets them
+    whole: bool = False  # whether the text holds the numbers of large tables and paths; else loading sets them
     chained: bool = False  # whether each evaluation waits for the last: one chunk has the statements of `short_chains`
     collected: bool = False  # whether like terms of these are collected before
 
@@ -354,7 +354,7 @@ def _with_lookups(tables, f, dialect):
     """C texts of tables and of what the lookups of a function need."""
     tables = tables + [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
     texts = [include("table_lanes.h" if dialect.prefix else "table.h"), *tables] if tables else []
-    if not jets_in(f):
+    if not jets_in(f) or dialect.whole:
         return texts
     name = f"{dialect.prefix.upper()}PATH_JETS"
     once = f"#ifndef HAS_{name}_{(order := _highest(f))}\n#define HAS_{name}_{order}\n{name}({order})\n#endif\n"
@@ -367,9 +367,14 @@ def _highest(f):
 
 
 def _jets_line(f, dialect):
-    """C line that takes the jets at t from the paths at p[0], of the piece that the last number of p may select."""
+    """C line that takes the jets at t from the paths at p[0], of the piece that the last number of p may select.
+
+    In text that is whole, `references` has the paths.
+    """
     if not jets_in(f):
         return ""
+    if dialect.whole:
+        return f"    references(t, {_highest(f)}, w);\n"
     paths = dialect.operand("p", 0)
     instant = dialect.operand("p", f.numel_in(2) - 1) if f.name_in(3) == BY_INSTANT else "t"
     return f"    {dialect.prefix}path_jets_{_highest(f)}({paths}, {instant}, t, {f.size1_in(3)}, w);\n"

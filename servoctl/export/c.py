@@ -16,6 +16,7 @@ from servoctl.codegen.function import Compiled
 from servoctl.control.law import Law
 from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
+from servoctl.export.references import references_of
 from servoctl.inversion.verdict import GROWS, HYPERBOLIC_ZEROS, verdict
 from servoctl.jets.lookup import lookups
 from servoctl.model.model import Model
@@ -50,6 +51,7 @@ def export_c(
     start: State | None = None,
     real: str = "double",
     thinned: float | None = None,
+    references: str = "table",
 ) -> tuple[Path, Path]:
     """Write a model's feedforward and residuals, or a law's step, as NAME.c and NAME.h: self-contained C99.
 
@@ -77,6 +79,10 @@ def export_c(
         Largest error of an entry of a law's schedule, relative to the largest magnitude of that entry along the
         schedule. Rows between those that are needed for it are left out, and computed by cubic polynomials. Default:
         all rows are written.
+    references : {"table", "argument"}
+        Of a model with references, whether their paths are written into the file, or `NAME_feedforward(t, ref, ...)`
+        and the others take the references with their derivatives at t, for a path that the controller makes itself. A
+        program that leaves motion free then has no `NAME_advance`: its state is integrated by `NAME_rates`.
 
     Returns
     -------
@@ -86,10 +92,11 @@ def export_c(
     Raises
     ------
     SpecificationError
-        If the name is no C identifier, the source has no expressions, a law has a start, or a model is thinned.
-        In floats also if costs of an allocation differ too much, or a spline has more data than floats count.
+        If the name is no C identifier, the source has no expressions, a law has a start, a model is thinned, or a
+        reference has no path for its table. In floats also if costs of an allocation differ too much, or a spline has
+        more data than floats count or breaks that are one instant in floats.
     NameUnknown
-        If `real` is another type.
+        If `real` is another type, or `references` neither "table" nor "argument".
     ServoError
         If the files cannot be written.
 
@@ -106,6 +113,10 @@ def export_c(
     without_effect(["thinned"] if not law and thinned is not None else [], "for a model, which has no schedule")
     start = None if start is None else require_kind(State, "start", start, "model.start(...)")
     named(real, ("double", "float"), "type of numbers")
+    named(references, ("table", "argument"), "form of references")
+    argument = references == "argument"
+    follows = not law and source.paths
+    without_effect(["references"] if argument and not follows else [], "for what follows no references")
     thinned = None if thinned is None else positive("thinned", thinned)
     name = ("law" if law else "model") if name is None else name
     _require_name(name)
@@ -118,7 +129,7 @@ def export_c(
             RuntimeWarning,
             stacklevel=2,
         )
-    contents = _of_law(source, thinned) if law else _of_model(source, start)
+    contents = _of_law(source, thinned) if law else _of_model(source, start, argument, real)
     if real == "float":
         _require_condition(source)
         _require_counted(contents)
@@ -187,7 +198,7 @@ def _require_counted(contents):
         )
 
 
-def _of_model(model, start):
+def _of_model(model, start, argument, real):
     actuation, control = model.signals("reaction" if model.reduction.ideal else "actuation")
     places, residual = model.signals("residuals")
     require_outputs(model.reduction)
@@ -200,64 +211,73 @@ def _of_model(model, start):
     u = Array("u", "Reaction u, SI" if model.reduction.ideal else "Actuation u, SI", actuation, units)
     r = Array("r", "Residuals r, each with its time derivatives, SI", levels)
     y = Array("y", "Outputs y, SI", outputs, units)
-    at = (TIME, z.input(), p.input())
     functions = {"actuation": control.expression, "residuals": residual.expression}
+    functions |= {"outputs": output.expression} if outputs else {}
+    flat = model.flat and model.reduction.top == 2
+    functions |= {"path": model.function("path").expression} if flat else {"rates": _rates(model)}
+    references = references_of(model, functions, argument, real)
+    first = TIME, *references.arguments
+    at = (*first, z.input(), p.input())
     routines = [
         Routine("actuation", "u at time t [s] and jets z of the motion.", (*at, u.output())),
         Routine("residuals", "r at time t [s] and jets z: zero on the motion.", (*at, r.output())),
     ]
-    if outputs:
-        functions["outputs"] = output.expression
-        routines.append(Routine("outputs", "y at time t [s] and jets z.", (*at, y.output())))
+    routines += [Routine("outputs", "y at time t [s] and jets z.", (*at, y.output()))] if outputs else []
     constants = [Constant("p", model.parameters, "Parameters p, with the values they have in the model")]
     if start is not None:
         constants += [Constant("t0", start.t, "Time of the start [s]")]
         constants += [Constant("x0", start.values, "State x at the start")]
-    feedforward = _algebraic if model.flat and model.reduction.top == 2 else _integrated
-    further, last, sources, sizes = feedforward(model, x, z, p, u)
+    last, sources, sizes = (_algebraic if flat else _integrated)(model, first, x, z, p, u, functions)
+    if argument:  # no step: it would need the references at three instants
+        last, sources = [one for one in last if one.name != "advance"], [one for one in sources if one != "advance.c"]
     return Contents(
-        (p, x, z, u, r, *([y] if outputs else [])),
+        (p, x, *references.arrays, z, u, r, *([y] if outputs else [])),
         tuple(c for c in constants if np.size(c.values)),
-        functions | further,
+        references.functions,
         (*routines, *last),
-        sources,
-        sizes,
+        tuple(sources),
+        sizes | references.sizes,
+        references.text,
     )
 
 
-def _algebraic(model, x, z, p, u):
+def _rates(model):
+    """The rates of a model's state, without the other outputs of its differential equation."""
+    f = model.function("ode").expression
+    arguments = f.sx_in()
+    names = f.name_in(), ["y"]
+    return ca.Function("rates", arguments, [f.call(arguments)[0][: len(model.state_names)]], *names)
+
+
+def _algebraic(model, first, x, z, p, u, functions):
     """Feedforward of a program that determines the motion: Newton's method along `path`."""
-    f = model.function("path").expression
     about = (
         "Feedforward: jets z and u at time t [s], by Newton's method. The coordinates in x are its guess, and x "
         "becomes the state, the guess of the next instant. Returns the number of corrections, or -1 if the iteration "
         "fails or an answer is no finite number: z and u are then unchanged, and x must be set again."
     )
-    arguments = (TIME, x.output(), p.input(), z.output(), u.output())
-    first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' in the outputs of `path`
-    sizes = {"N": model.n, "NQ": model.nq, "NY": f.numel_out(0), "FIRST": first}
+    arguments = (*first, x.output(), p.input(), z.output(), u.output())
+    begin = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' in the outputs of `path`
+    sizes = {"N": model.n, "NQ": model.nq, "NY": functions["path"].numel_out(0), "FIRST": begin}
     sizes |= {"ITERATIONS": ITERATIONS, "TOLERANCE": TOLERANCE, "STALLED": 0.0, "NJ": len(z.names), "NU": len(u.names)}
-    return {"path": f}, [Routine("feedforward", about, arguments, "int")], ("answer.c", "newton.c"), sizes
+    return [Routine("feedforward", about, arguments, "int")], ("answer.c", "newton.c"), sizes
 
 
-def _integrated(model, x, z, p, u):
+def _integrated(model, first, x, z, p, u, functions):
     """Feedforward of a program with internal dynamics, and a step of the plan's state."""
-    f, size = model.function("ode").expression, len(model.state_names)
-    arguments = f.sx_in()
-    rates = ca.Function("rates", arguments, [f(*arguments)[:size]])
     about = {
         "rates": "dx/dt at time t [s] and state x of the plan; not finite where its equations lose rank.",
         "feedforward": f"Feedforward: jets z and u at time t [s] and state x of the plan. {FINITE}",
         "advance": f"Takes the plan's state x from time t to t + h [s]: a Runge-Kutta step of order 4. {FINITE}",
     }
-    at = (TIME, x.input(), p.input())
+    at = (*first, x.input(), p.input())
     routines = [
         Routine("rates", about["rates"], (*at, x.output("dx"))),
         Routine("feedforward", about["feedforward"], (*at, z.output(), u.output()), "int"),
         Routine("advance", about["advance"], (TIME, Scalar("h"), x.output(), p.input()), "int"),
     ]
-    sizes = {"N": model.n, "NX": size, "NJ": len(z.names), "NU": len(u.names)}
-    return {"rates": rates}, routines, ("answer.c", "integrated.c"), sizes
+    sizes = {"N": model.n, "NX": functions["rates"].numel_out(0), "NJ": len(z.names), "NU": len(u.names)}
+    return routines, ("answer.c", "integrated.c", "advance.c"), sizes
 
 
 def _of_law(law, thinned):

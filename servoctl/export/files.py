@@ -116,9 +116,12 @@ class Routine:
         return f"{self.result} {prefix}_{self.name}({arguments})"
 
     def definition(self, prefix):
-        """C definition."""
-        call = f"{self.name}({', '.join(argument.name for argument in self.arguments)});"
-        return f"\n{self.declaration(prefix)}\n{{\n    {'return ' if self.result == 'int' else ''}{call}\n}}\n"
+        """C definition; the static function takes jets of references `ref` at the end of its parameters."""
+        names = [argument.name for argument in self.arguments]
+        joined = "    double all[NALL];\n    join(p, ref, all);\n" if "ref" in names else ""
+        names = ["all" if name == "p" else name for name in names if name != "ref"] if joined else names
+        call = f"{'return ' if self.result == 'int' else ''}{self.name}({', '.join(names)});"
+        return f"\n{self.declaration(prefix)}\n{{\n{joined}    {call}\n}}\n"
 
 
 @frozen
@@ -131,6 +134,7 @@ class Contents:
     routines: tuple  # of Routine
     sources: tuple = ()  # files of the folder `sources`, and headers of `codegen/c`, whose functions may call these
     sizes: dict = field(default_factory=dict)  # macros of the sources, by name
+    before: str = ""  # C text before the functions
 
 
 def write(folder, name, contents, real="double"):
@@ -183,18 +187,19 @@ def _source(name, contents):
         *(f"#define {key} {emit.literal(value)}\n" for key, value in contents.sizes.items()),
         *(f"\n{c.declaration(name)} = {c.text};\n" for c in contents.constants),
         f"\n{source('inverse_erf.h')}" if inverse else "",
+        contents.before,
         functions.replace(table, source("table.h"), 1).replace(table, ""),
-        *map(_text_of, contents.sources),
+        *map(text_of, contents.sources),
         *(routine.definition(name) for routine in contents.routines),
     ]
     return "".join(parts)
 
 
-def _text_of(file):
+def text_of(file):
     """The text of a source, with the headers that it includes."""
     sources = resources.files("servoctl.export") / "sources"
     text = source(file) if file.endswith(".h") else (sources / file).read_text(encoding="utf-8")
-    return re.sub(r'#include "(.*)"\n', lambda found: "" if found[1] == "unit.h" else _text_of(found[1]), text)
+    return re.sub(r'#include "(.*)"\n', lambda found: "" if found[1] == "unit.h" else text_of(found[1]), text)
 
 
 def _outside_comments(convert, text):

@@ -84,7 +84,7 @@ def fits(model):
         alone = not model.reduction.orders and switching(model) is None and not steep(model, squares=False)
         return alone and not ca.depends_on(f(*inputs), inputs[0])
 
-    return not model.flat and not model.knots and model.once("fits lanes", smooth)
+    return not (model.flat or model.knots or model.paths) and model.once("fits lanes", smooth)
 
 
 def integrate(model, last, span, cases, rtol, times, threads=None, progress=None):
@@ -126,9 +126,9 @@ def plans_fit(model):
 
 
 def plan_many(model, span, cases, times, threads=None, progress=None):
-    """Plans from states x0 (N, n_x) with parameters p (N, n_p) over a span; the results are those of `integrate`.
+    """Plans from states x0 (N, n_x) with parameters p (N, n_p), as functions have them, over a span.
 
-    The last of the times is the end of the span; the largest sizes are zero.
+    The results are those of `integrate`; the last of the times is the end of the span, the largest sizes are zero.
     """
     f = model.function("path")
     library = _plan_library(f, model)

@@ -14,7 +14,7 @@ from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate
 from servoctl.reduction.rows import row_levels
 from servoctl.spec.coordinates import jet_name
-from servoctl.spec.references import function_of
+from servoctl.spec.references import called, function_of
 
 
 class Invariants:
@@ -53,6 +53,10 @@ class Invariants:
         p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
         y = ca.densify(cse(ca.vertcat(*outputs)))
         return function_of(self.q, self.references, name, x, p, y, jets=jets)
+
+    def called(self, f, x, p):
+        """The output of one of the model's functions as an expression; see `references.called`."""
+        return called(self.q, self.references, f, x, p)
 
     @cached_property
     def invariant_rows(self):

@@ -18,6 +18,7 @@ from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
 from servoctl.model.following import SMOOTHER, breaks_within
 from servoctl.model.jets import jet_names_to
+from servoctl.model.points import with_place
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
@@ -33,7 +34,7 @@ from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.spec.references import followed_path
+from servoctl.spec.references import followed_path, required_paths
 from servoctl.values import evenly, read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
@@ -170,7 +171,7 @@ class Model(Detailed):
         if not isinstance(other, Model):
             return NotImplemented
         known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
-        same = known and place_of(self) == place_of(other)
+        same = known and place_of(self) == place_of(other) and self.paths == other.paths
         return self is other or (same and np.array_equal(self.parameters, other.parameters))
 
     def __hash__(self):
@@ -242,19 +243,16 @@ class Model(Detailed):
 
     @cached_property
     def _followed(self):
-        if missing := [name for name, path in self.paths.items() if path is None]:
-            raise SpecificationError(
-                f"No path was given for {', '.join(missing)}.",
-                "A motion follows a path for each reference of the program.",
-                do=f"Write model.with_references({', '.join(f'{name}=...' for name in missing)}).",
-                missing=missing,
-            )
-        return Followed([path.held() for path in self.paths.values()])
+        return Followed([path.held() for path in required_paths(self.paths).values()])
 
     @cached_property
     def p(self):
         """The parameters of compiled functions: those of the model, after the place of the paths that it follows."""
-        return read_only(np.append(self._followed.address, self.parameters)) if self.paths else self.parameters
+        return read_only(self.p_with(self.parameters)) if self.paths else self.parameters
+
+    def p_with(self, parameters):
+        """The same with other parameters (n_p,) or (n_p, N)."""
+        return with_place((self._followed.address,) if self.paths else (), parameters)
 
     def instants(self, t):
         """Instants (N, 1 + R) of times (N,) [s]: with the jets of the paths that are followed there."""

@@ -23,8 +23,9 @@ def linear_levels(model, held):
     if not set(held) <= set(names) or len(set(held)) != model.free or model.reduction.cascade is not None:
         return None
     f, m = model.function("invariants").expression, len(invariant_names(model))
-    t, x, p = f.sx_in()
-    values, entries = f(t, x, p)[:m], x.elements()
+    arguments = f.sx_in()
+    x, values = arguments[1], f.call(arguments)[0][:m]
+    entries = x.elements()
     of = [0 if i < model.nq else 1 + (i - model.nq) // model.n for i in range(len(names))]
     rows = [[i for i, e in enumerate(entries) if ca.depends_on(value, e)] for value in values.elements()]
     levels = []
@@ -41,9 +42,11 @@ def linear_levels(model, held):
 def same_start(model, held, parameters):
     """Whether starts with one set of held values are the same for all values of some parameters, by their names."""
     f, m = model.function("invariants").expression, len(invariant_names(model))
-    t, x, p = f.sx_in()
+    arguments = f.sx_in()
+    p = arguments[2][-len(model.parameters) :] if len(model.parameters) else ca.SX(0, 1)
     places = [i for i, name in enumerate(model.numbers) if name in parameters]
-    return set(held) <= set(model.state_names) and not (places and ca.depends_on(f(t, x, p)[:m], p[places]))
+    values = f.call(arguments)[0][:m]
+    return set(held) <= set(model.state_names) and not (places and ca.depends_on(values, p[places]))
 
 
 def linear_starts(model, t, held, p):
@@ -62,7 +65,7 @@ def linear_starts(model, t, held, p):
     solved[:] = True
     with np.errstate(all="ignore"):
         for rows, unknown in (level for level in levels for _ in range(PASSES)):
-            y = f.grid(t, states.T, p.T)
+            y = f.grid(t, states.T, model.p_with(p.T))
             jacobian = y[m:].reshape(states.shape[1], m, -1)[np.ix_(unknown, rows)].transpose(2, 1, 0)
             sizes = np.linalg.norm(jacobian, axis=2)
             scaled, off = jacobian / sizes[:, :, None], y[rows].T / sizes

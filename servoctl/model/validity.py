@@ -13,6 +13,7 @@ import numpy as np
 from servoctl.codegen.function import GRID_POINTS, compiled
 from servoctl.jets.branches import sizes_of_terms
 from servoctl.model.equations import invariant_names
+from servoctl.model.points import place_of, through, with_place
 from servoctl.reduction.appell import NEGATIVE
 from servoctl.reduction.manifold import ON_MANIFOLD, at_nominal_size, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
@@ -36,9 +37,9 @@ class Quantities:
     counts: dict  # scalars in each group, by name
     pivots: np.ndarray  # (n_pivots,), least sizes at the points where they were chosen
 
-    def at(self, t, jets, values):
+    def at(self, t, jets, values, place=()):
         """Values and sizes (2, n, N) of each group, by name; the parameters (n_p,) or (n_p, N)."""
-        result = _evaluated(self.function, t, jets, values)
+        result = _evaluated(self.function, t, jets, values, place)
         result = result.reshape(2, -1, len(t))
         return dict(zip(self.counts, np.split(result, np.cumsum([*self.counts.values()])[:-1], axis=1), strict=True))
 
@@ -55,7 +56,11 @@ def quantities(equations):
     sizes = [*sizes_of_terms(scalars[:sized]), ca.SX(counts["mass"], 1)]
     f = compiled(equations.function("quantities", equations.jets, [*scalars, *sizes]), "quantities")
     jets = np.vstack([r.points.jet(k) for k in range(r.top + 1)]).astype(float)
-    values, _ = Quantities(f, counts, None).at(r.points.t.astype(float), jets, r.points.values)["pivots"]
+    followed = through(r, [f.expression]) if r.references else None
+    if r.references and followed is None:
+        return Quantities(None, counts, np.zeros(0))
+    place = (followed.address,) if followed else ()
+    values, _ = Quantities(f, counts, None).at(r.points.t.astype(float), jets, r.points.values, place)["pivots"]
     return Quantities(f, counts, np.abs(values).min(axis=1, initial=np.inf))
 
 
@@ -80,7 +85,7 @@ def affirmed(model, values):
 def affirmed_each(model, values):
     """The same for each column of parameters (n_p, C), (C,) array of bool."""
     result, points = np.zeros(values.shape[1], bool), len(model.reduction.points.t)
-    if model.paths or not points:  # points have jets of references of their own: extended precision decides
+    if not points:
         return result
     known = model.once("quantities", lambda: quantities(model.equations))
     if known.function is None:
@@ -101,6 +106,12 @@ def affirmed_each(model, values):
     return result
 
 
+def _place(model):
+    """The place of paths through the points, for the functions that are evaluated there."""
+    known = model.once("quantities", lambda: quantities(model.equations))
+    return place_of(model, [known.function, model.function("invariants"), model.function("ode")])
+
+
 def points_with(model):
     """States (n_x, points) at which ranks were decided, moved to the manifold of the model's own parameters.
 
@@ -108,6 +119,8 @@ def points_with(model):
     """
     at, changed = _points_of(model), model.parameters != model.reduction.points.values
     if not changed[_of_invariants(model)].any():
+        return at
+    if model.once("quantities", lambda: quantities(model.equations)).function is None and model.paths:
         return at
     moved, _, jets = _moved(model, at, model.parameters[:, None])
     return jets[: len(at)] if len(moved) else at
@@ -119,7 +132,8 @@ def _of_invariants(model):
     def places():
         f = model.function("invariants").expression
         t, x, p, *r = f.sx_in()
-        return np.flatnonzero(ca.which_depends(f(t, x, p, *r), p, 1, False)).tolist()
+        depends = ca.which_depends(f(t, x, p, *r), p, 1, False)
+        return np.flatnonzero(depends[-len(model.parameters) :] if len(model.parameters) else []).tolist()
 
     return model.once("parameters of the invariants", places)
 
@@ -137,7 +151,7 @@ def _plainly_valid(model, x, values):
         part = values[:, first : first + TOGETHER]
         count = part.shape[1]
         at = np.repeat(t, count), np.repeat(x, count, axis=1), np.tile(part, len(t))
-        met = _evaluated(criterion, *(_on_manifold(model, *at) if moving else at))
+        met = _evaluated(criterion, *(_on_manifold(model, *at) if moving else at), _place(model))
         result[first : first + count] = (met > 0).reshape(len(t), count).all(axis=0)
     return result
 
@@ -150,7 +164,8 @@ def _criterion(model, varied):
     """
     known, equations = model.once("quantities", lambda: quantities(model.equations)), model.equations
     t, x, p, n, n_x = equations.q.t, equations.state, equations.parameters, model.n, len(model.state_names)
-    y = known.function.expression(t, ca.vertcat(x, model.function("ode").expression(t, x, p)[n_x - n : n_x]), p)
+    rates = equations.called(model.function("ode").expression, x, p)
+    y = equations.called(known.function.expression, ca.vertcat(x, rates[n_x - n : n_x]), p)
     value, size = ca.vertsplit(y, y.numel() // 2)
     depend = [True] * y.numel() if varied is None else ca.which_depends(y, p[varied], 1, True) if varied else []
     some = {i % value.numel() for i, depends in enumerate(depend) if depends}
@@ -179,7 +194,7 @@ def _on_manifold(model, t, x, p):
 
     f = model.once("to the manifold", step)
     for _ in range(MOVES):
-        *moved, near = _evaluated(f, t, x, p)
+        *moved, near = _evaluated(f, t, x, p, _place(model))
         if (near > 0).all():
             break
         x = np.array(moved)
@@ -189,7 +204,7 @@ def _on_manifold(model, t, x, p):
 def _manifold(model, t, x, p):
     """Expressions of the state after a step of `least_steps` to the manifold, and whether it is there before."""
     m, sizes = len(invariant_names(model)), _sizes_of(model)
-    y = model.function("invariants").expression(t, x, p)
+    y = model.equations.called(model.function("invariants").expression, x, p)
     residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, -1))
     scales = ca.sqrt(jacobian**2 @ (sizes + ca.fabs(x)) ** 2)
     off = [ca.fabs(residual[i]) <= ON_MANIFOLD * ca.if_else(scales[i] > 0, scales[i], 1) for i in range(m)]
@@ -209,10 +224,10 @@ def _sizes_of(model):
 def _valid(model, known, t, z, values):
     """Whether a derivation is valid and the inertia positive in each case, by jets z at times t, case by case."""
     n, cases, r = model.n, values.shape[1], model.reduction
-    p = np.repeat(values, len(t) // cases, axis=1)
+    p, place = np.repeat(values, len(t) // cases, axis=1), _place(model)
 
     def at(z):
-        found = known.at(t, z, p)
+        found = known.at(t, z, p, place)
         return {name: group.reshape(*group.shape[:2], cases, group.shape[2] // cases) for name, group in found.items()}
 
     found = at(z)
@@ -259,11 +274,11 @@ def _moved(model, at, values):
     invariants, rates = model.function("invariants"), model.function("ode")
     t = np.tile(points.t.astype(float), cases)
     x = np.tile(at, cases)
-    p, m = np.repeat(values, n_points, axis=1), len(invariant_names(model))
+    p, m, place = np.repeat(values, n_points, axis=1), len(invariant_names(model)), _place(model)
     left, moved = np.arange(cases), np.zeros(cases, bool)
     for _ in range(MOVES):
         here = (left[:, None] * n_points + np.arange(n_points)).ravel()
-        y = _evaluated(invariants, t[here], x[:, here], p[:, here])
+        y = _evaluated(invariants, t[here], x[:, here], p[:, here], place)
         residual, jacobian = y[:m], y[m:].reshape(n_x, m, len(here)).swapaxes(0, 1)
         finite = np.isfinite(y).all(axis=0)
         near = (np.abs(residual) <= ON_MANIFOLD * gradient_scales(jacobian, x[:, here], sizes)).all(axis=0) & finite
@@ -276,12 +291,13 @@ def _moved(model, at, values):
         x[:, here[on]] += least_steps(jacobian[:, :, on], residual[:, on], sizes).astype(float)
     here = np.flatnonzero(np.repeat(moved, n_points))
     t, x = t[here], x[:, here]
-    highest = _evaluated(rates, t, x, p[:, here])[n_x - model.n : n_x]
+    highest = _evaluated(rates, t, x, p[:, here], place)[n_x - model.n : n_x]
     return np.flatnonzero(moved), t, np.vstack([x, highest])
 
 
-def _evaluated(f, t, x, p):
+def _evaluated(f, t, x, p, place):
     """The outputs (n_y, N) of a Compiled, which few points do not load."""
+    p = with_place(place, p)
     if len(t) > GRID_POINTS:
         return f.grid(t, x, p)
     y = np.empty((f.n_y, len(t)))

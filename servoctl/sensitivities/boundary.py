@@ -85,7 +85,7 @@ class _Linear:
 def _rates_by(model, names):
     """∂X'/∂X and ∂X'/∂p, column by column, as a function of (t, X, p)."""
     e = model.equations
-    rates = e.ode()(e.q.t, e.state, e.parameters)[: e.state.numel()]
+    rates = e.called(e.ode(), e.state, e.parameters)[: e.state.numel()]
     both = ca.vertcat(e.state, parameter_symbols(e, names))
     f = e.function("rates_by", e.state, [ca.vec(ca.densify(ca.jacobian(rates, both)))])
     return compiled(f, "rates_by", ("rk",))  # which is evaluated at many points, and therefore compiled

@@ -229,7 +229,7 @@ def _tangents(run, S, names, initial, kinds):
     for first, end, model in run.variants or ((0, len(run.t), run.model),):
         f, t = tangent_at(model, names, len(initial), kinds), run.t[first:end]
         of_state = S[:, :, first:end].swapaxes(0, 1).reshape(-1, len(t))
-        y = f.grid(t, np.concatenate([run.jets[: len(model.jet_names), first:end], of_state]), model.parameters)
+        y = f.grid(t, np.concatenate([run.jets[: len(model.jet_names), first:end], of_state]), model.p)
         sizes = [len(model.jet_names), *(len(model.signals(kind)[0]) for kind in kinds)]
         blocks = zip(np.split(y, np.cumsum(sizes[:-1]) * K), sizes, strict=True)
         parts.append(np.concatenate([block.reshape(K, size, -1).swapaxes(0, 1) for block, size in blocks]))
@@ -256,7 +256,7 @@ def _tangent_at_start(run, names, initial):
     model = run.variant(0)
     t, x = start_of(run)
     m, n_x = len(invariant_names(model)), len(x)
-    y = invariants_by(model, names)(t, x, model.parameters)
+    y = invariants_by(model, names)(t, x, model.p)
     G = y[m:].reshape(n_x + len(names), m).T
     G, by_parameters = G[:, :n_x], G[:, n_x:]
     held = run.start.held if run.start is not None else ()
@@ -320,7 +320,7 @@ def _integrated(model, run, names, S):
         f = variational(variant, names, K - len(names))
         inside = np.flatnonzero((forward * run.t >= forward * a) & (forward * run.t <= forward * b))
         solved = solve_ivp(
-            lambda t, z, f=f, p=variant.parameters: f(t, z, p),
+            lambda t, z, f=f, p=variant.p: f(t, z, p),
             (a, b),
             y,
             method,
@@ -364,7 +364,7 @@ def _shifted(model, run, names, t, x, columns):
     """The jump (n_x, K) of the tangent at a knot t that moves with parameters, where the rates jump."""
     first = start_of(run)[0]
     length, f = abs(run.t[-1] - first), model.function("ode")
-    sides = [f(t + side * BESIDE_KNOT * length, x, model.parameters)[: len(x)] for side in (-1.0, 1.0)]
+    sides = [f(t + side * BESIDE_KNOT * length, x, model.p)[: len(x)] for side in (-1.0, 1.0)]
     before, after = sides if run.t[-1] > first else sides[::-1]
     jump = np.zeros((len(x), columns))
     if np.abs(after - before).max() > JUMPS * np.abs(sides).max():

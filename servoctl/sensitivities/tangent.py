@@ -108,7 +108,7 @@ def variational(model, names, initial):
     S = ca.SX.sym("S", e.state.numel(), len(names) + initial)
     tangent, top = Tangent(e, names, S), ca.vertcat(*e.q.gamma(e.top))
     rates = e.rates(top)
-    state_rates = e.ode()(e.q.t, e.state, e.parameters)[: e.state.numel()]
+    state_rates = e.called(e.ode(), e.state, e.parameters)[: e.state.numel()]
     tangent_rates = ca.substitute(tangent.of(rates), top, state_rates[-e.q.n :])
     x = ca.vertcat(e.state, ca.vec(S))
     return compiled(e.function("variational", x, [state_rates, ca.vec(ca.densify(tangent_rates))]), "variational")

@@ -124,6 +124,25 @@ def function_of(q, names, name, x, p, *outputs, jets="r"):
     return ca.Function(name, [*inputs.values()], outputs, [*inputs], [f"y{i or ''}" for i in range(len(outputs))])
 
 
+def called(q, names, f, x, p):
+    """The output of a function by `function_of` as an expression, at states x and parameters p without a place."""
+    columns = range(f.size2_in(3) if f.n_in() > 3 else 0)
+    jets = [ca.horzcat(*(ca.vertcat(*(q.family.jet(name, k) for name in names)) for k in columns))] * bool(columns)
+    return f(q.t, x, ca.vertcat(ca.SX(0 if names else ca.SX(0, 1)), p), *jets)
+
+
+def required_paths(paths):
+    """The paths by name; refused where there is none yet."""
+    if missing := [name for name, path in paths.items() if path is None]:
+        raise SpecificationError(
+            f"No path was given for {', '.join(missing)}.",
+            "A motion follows a path for each reference of the program and of the mechanism.",
+            do=f"Write .with_references({', '.join(f'{name}=...' for name in missing)}) on the model or the plant.",
+            missing=missing,
+        )
+    return paths
+
+
 def followed_path(name, path):
     """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
     path = None if path is None else as_path(path)

@@ -222,7 +222,8 @@ class _Many:
 
     def plans(self, span, times, threads, progress):
         """Compute the plans whose pivots do not fall."""
-        which, *cases = self._prepared(span)
+        which, x0, p = self._prepared(span)
+        cases = x0, self.model.p_with(p.T).T
         ends, samples, self.interrupted = plan_many(self.model, span, cases, times, threads, progress)
         if ends is not None:
             good = ends[:, 0] > 0

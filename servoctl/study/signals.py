@@ -59,9 +59,9 @@ class Signals(ByName, Mapping):
 
     def _evaluated(self, f, part):
         """A function of the jets, or the highest of these, (n, K, N) for some motions."""
-        count = len(part)
-        t, p = np.repeat(self._t, count), np.tile(self._parameters[:, part], len(self._t))
-        jets = with_highest(self._model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
+        model, count = self._model, len(part)
+        t, p = np.repeat(self._t, count), np.tile(model.p_with(self._parameters[:, part]), len(self._t))
+        jets = with_highest(model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
         y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
         return y.reshape(len(y), len(self._t), count)
 
