@@ -4,6 +4,7 @@ import ctypes
 import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -27,8 +28,8 @@ _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
 class Unit:
     """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
-    `table` maps t_k and row k of the schedule to values that are common to all cases at a sample. `states`, `inputs`
-    and `residuals` (Residuals or None) are gathered.
+    `table` maps t_k and row k of the schedule, with jets of references below it, to values that are common to all cases
+    at a sample. `states`, `inputs` and `residuals` (Residuals or None) are gathered.
     """
 
     text: str
@@ -60,7 +61,7 @@ def unit(plant, law, disturbed, residuals=None):
     key = (plant.equations, law.measures, disturbed, phi)
     if key not in units:
         units[key] = _derived(plant, law, disturbed, residuals)
-    return units[key]
+    return replace(units[key], residuals=residuals)  # which may follow other paths
 
 
 def _derived(plant, law, disturbed, residuals):
@@ -71,7 +72,8 @@ def _derived(plant, law, disturbed, residuals):
     still = ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed))
     f, w, w_values = _fastest((t, x, p, rates), still, applied)
     t_k, row, written, common_values = _law_in_c(law)
-    phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p), t_k)
+    r = ca.SX.sym("r", len(residuals.jets) if residuals else 0)
+    phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p, r), ca.vertcat(t_k, r))
     phi, v, v_values = _apart(phi, constants)
     vectors = {"NX": x, "NP": p, "NW": w, "NV": v, "NL": common_values, "NS": s, "NR": phi}
     sizes = {name: vector.numel() for name, vector in vectors.items()}
@@ -97,17 +99,17 @@ def _derived(plant, law, disturbed, residuals):
         "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
         emit.include("batch.c"),
     ]
-    table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
+    table = _function("table", t_k, ca.SX(0, 1), ca.vertcat(row, r), ca.vertcat(common_values, s_values))
     table = compiled(table, "table")
     return Unit("".join(parts), table, plant.state_names, plant.inputs, residuals)
 
 
-def _signals(plant, residuals, t, x, p):
-    """Residuals of the state x at t."""
+def _signals(plant, residuals, t, x, p, r):
+    """Residuals of the state x at t, with jets of references r."""
     if not residuals:
         return ca.SX(0, 1)
     # a single parameter indexed by [] is a row in CasADi, not a column
-    numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in residuals.places))
+    numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in residuals.places), r)
     return residuals.expression(t, x, plant.state_names, numbers)
 
 
@@ -191,7 +193,7 @@ class Gathered:
 def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, step=None):
     """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
-    `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
+    `loop` holds for all cases, without its x0 and noise. `cases` are parameters of the plant (n_c, N), initial
     states (n_x, N) and factors of the disturbances (n_d, N); `noise` are standard deviations of the measurements (n_y,)
     and keys of the cases (N, 2). `step` is the C function of a law that is called.
     `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
@@ -211,7 +213,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, s
     depth = 1 + max(loop.delay, late)
     constants, x0, scale = (part[:, columns] for part in cases)
     deviations, keys = noise or (None, None)
-    given = {"constants": constants, "x0": x0, "scale": scale, "p": None, "table": _common(unit, loop), "depth": depth}
+    given = {"constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "depth": depth}
     given |= {"deviations": deviations, "keys": None if keys is None else keys[columns]}
     given |= {"law": step and ctypes.cast(step, ctypes.c_void_p), "columns": blocks * width, "every": every}
     given |= {"traced": traced, "n_traced": len(traced), "gathered": gathered, "trace": trace}
@@ -236,5 +238,6 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, s
 def _common(unit, loop):
     """The table of values that are common to all cases, a row per sample."""
     samples = np.arange(loop.samples + 1)
-    rows = loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
-    return unit.table.grid(loop.t0 + samples * loop.period, np.zeros((0, len(samples))), rows).T
+    t, rows = loop.t0 + samples * loop.period, loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
+    jets = [unit.residuals.jets.at(t)] if unit.residuals else []
+    return unit.table.grid(t, np.zeros((0, len(samples))), np.vstack([rows, *jets])).T

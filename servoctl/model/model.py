@@ -27,12 +27,12 @@ from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.manifold import jet_of_reference
+from servoctl.reduction.manifold import references_at
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.spec.references import followed_path
+from servoctl.spec.references import followed_path, required_paths
 from servoctl.values import evenly, read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
@@ -168,7 +168,7 @@ class Model(Detailed):
         if not isinstance(other, Model):
             return NotImplemented
         known = self._store.fingerprint is not None and self._store.fingerprint == other._store.fingerprint
-        same = known and place_of(self) == place_of(other)
+        same = known and place_of(self) == place_of(other) and self.paths == other.paths
         return self is other or (same and np.array_equal(self.parameters, other.parameters))
 
     def __hash__(self):
@@ -245,14 +245,7 @@ class Model(Detailed):
 
     @cached_property
     def _followed(self):
-        if missing := [name for name, path in self.paths.items() if path is None]:
-            raise SpecificationError(
-                f"No path was given for {', '.join(missing)}.",
-                "A motion follows a path for each reference of the program.",
-                do=f"Write model.with_references({', '.join(f'{name}=...' for name in missing)}).",
-                missing=missing,
-            )
-        return Followed([path.held() for path in self.paths.values()])
+        return Followed([path.held() for path in required_paths(self.paths).values()])
 
     @cached_property
     def p(self):
@@ -271,11 +264,7 @@ class Model(Detailed):
 
     def references_at(self, t):
         """Derivatives of the references at an instant, by names as points near a state have them."""
-        found = {}
-        for name, path in zip(self.paths, self._followed.paths, strict=True) if self.paths else ():
-            jets = path.jets([t], path.coefficients.shape[2] - 1)[:, 0, 0]
-            found |= {jet_of_reference(name, k): value for k, value in enumerate(jets.tolist()[: JETS + 1])}
-        return found
+        return references_at(required_paths(self.paths), t)
 
     def _holds(self, values):
         """Whether every decision of the derivation is the same with other parameters."""
