@@ -13,6 +13,7 @@ from servoctl.codegen import compiler, emit
 from servoctl.codegen.compiler import lanes
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
+from servoctl.codegen.paths import jets_in
 from servoctl.control.loop import Arguments
 from servoctl.values import frozen
 
@@ -66,11 +67,12 @@ def unit(plant, law, disturbed, residuals=None):
 
 def _derived(plant, law, disturbed, residuals):
     """Rates, law and residuals in C; parts that depend on the case alone, or on the sample alone, are split off."""
-    n_c, n_u, project = len(plant.parameters), len(plant.inputs), plant.equations.project()
-    t, x, p, rates = _rates(plant, disturbed)
+    n_c, n_u, project = plant.at_u, len(plant.inputs), plant.equations.project()
+    t, x, p, followed, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], *(p[i] for i in disturbed))
     still = ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed))
-    f, w, w_values = _fastest((t, x, p, rates), still, applied)
+    place = p[: n_c - len(plant.parameters)]
+    f, w, w_values = _fastest((t, x, p, rates, followed), place, still, applied)
     t_k, row, written, common_values = _law_in_c(law)
     r = ca.SX.sym("r", len(residuals.jets) if residuals else 0)
     phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p, r), ca.vertcat(t_k, r))
@@ -96,7 +98,7 @@ def _derived(plant, law, disturbed, residuals):
         _rates_of_block(f),
         written,
         _lanes("signals", t_k, ca.vertcat(x, v), s, phi, emit.LANES_COMMON),
-        "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
+        "" if project is None else emit.function(project, "change", emit.LANES),
         emit.include("batch.c"),
     ]
     table = _function("table", t_k, ca.SX(0, 1), ca.vertcat(row, r), ca.vertcat(common_values, s_values))
@@ -109,7 +111,8 @@ def _signals(plant, residuals, t, x, p, r):
     if not residuals:
         return ca.SX(0, 1)
     # a single parameter indexed by [] is a row in CasADi, not a column
-    numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in residuals.places), r)
+    first = plant.at_u - len(plant.parameters)
+    numbers = ca.vertcat(ca.SX(0, 1), *(p[first + i] for i in residuals.places), r)
     return residuals.expression(t, x, plant.state_names, numbers)
 
 
@@ -124,24 +127,25 @@ def _law_in_c(law):
 
 
 def _rates(plant, disturbed):
-    """Symbols t, x and p of a plant, and x' with no generalised force but those that are disturbed."""
+    """Symbols t, x, p and r of a plant, and x' with no generalised force but those that are disturbed."""
     f = plant.function("ode").expression
-    t, x, p = f.sx_in()
-    first = len(plant.parameters) + len(plant.inputs)
+    t, x, p, *r = f.sx_in()
+    first = plant.at_u + len(plant.inputs)
     calm = [i for i in range(first, p.numel()) if i not in disturbed]
-    return t, x, p, ca.substitute(f(t, x, p), p[calm], ca.SX.zeros(len(calm)))
+    return t, x, p, *(r or [ca.SX(0, 1)]), ca.substitute(f(t, x, p, *r), p[calm], ca.SX.zeros(len(calm)))
 
 
-def _fastest(of_all, still, applied):
-    """The rates (t, x, p, x') as a function of (t, x, [w; applied]), symbols w, and their values by symbols `still`.
+def _fastest(of_all, place, still, applied):
+    """The rates (t, x, p, x', r) as a function of (t, x, [w; applied], r), symbols w, and their values by `still`.
 
-    What each case computes once takes no time.
+    What each case computes once takes no time. The place of paths, if any, is the first of w.
     """
-    f, (t, x, p, _) = _function("rates", *of_all), of_all
-    ways = []
-    for rates in (f(t, x, p), *(ca.Function("way", f.sx_in(), [way])(t, x, p) for way in emit.other_ways(f))):
+    f, (t, x, p, _, r) = _function("rates", *of_all), of_all
+    inputs, ways = (t, x, p, r)[: f.n_in()], []
+    for rates in (f(*inputs), *(ca.Function("way", f.sx_in(), [way])(*inputs) for way in emit.other_ways(f))):
         rest, w, values = _apart(rates, still)
-        ways.append((_function("rates", t, x, ca.vertcat(w, applied), rest), w, values))
+        w, values = ca.vertcat(place, w), ca.vertcat(place, values)
+        ways.append((_function("rates", t, x, ca.vertcat(w, applied), rest, r), w, values))
     return min(ways, key=lambda way: emit.cost(way[0], emit.LANES_INLINE))
 
 
@@ -151,8 +155,10 @@ def _apart(expression, symbols):
     return rest, ca.vertcat(ca.SX(0, 1), *new), ca.vertcat(ca.SX(0, 1), *values)
 
 
-def _function(name, t, x, p, value):
-    return ca.Function(name, [t, x, p], [ca.densify(ca.cse(value))])
+def _function(name, t, x, p, value, r=None):
+    """The function (t, x, p), or (t, x, p, r) where there are jets of references."""
+    inputs = {"t": t, "x": x, "p": p} | ({"r": r} if r is not None and r.numel() else {})
+    return ca.Function(name, [*inputs.values()], [ca.densify(ca.cse(value))], [*inputs], ["y"])
 
 
 def _lanes(name, t, x, p, value, dialect=emit.LANES):
@@ -163,7 +169,7 @@ def _lanes(name, t, x, p, value, dialect=emit.LANES):
 def _rates_of_block(f):
     """C text of the rates of the vectors of a block, inlined if they are short."""
     head = "INLINE void rates_of_block(const W t, const W *const x[], const W *const p[], W (*y)[NX + 1])\n{\n"
-    if emit.operations(f) > INLINED:
+    if emit.operations(f) > INLINED or jets_in(f):
         each = (f"    rates(t, x[{g}], p[{g}], y[{g}]);\n" for g in range(VECTORS))
         return emit.function(f, "rates", emit.LANES) + head + "".join(each) + "}\n"
     suffixes = ("", *map(str, range(1, VECTORS)))

@@ -149,6 +149,9 @@ class Jets:
     def __len__(self):
         return len(self.places)
 
+    def __getstate__(self):
+        return {name: value for name, value in vars(self).items() if not isinstance(value, ca.SX)}
+
     def of(self, instants):
         """Their values (n, N) at instants (N, 1 + R) of points."""
         columns = [1 + self._names.index(name) * (JETS + 1) + k for name, k in self.places]
