@@ -4,6 +4,7 @@ import ctypes
 import os
 import weakref
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from servoctl.codegen import compiler, emit
 from servoctl.codegen.compiler import lanes
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.native import pointer
+from servoctl.codegen.paths import jets_in
 from servoctl.control.loop import Arguments
 from servoctl.values import frozen
 
@@ -27,8 +29,8 @@ _UNITS = weakref.WeakKeyDictionary()  # step of a law -> its units
 class Unit:
     """The C text of a batch for any number of lanes, and the function of its table; made by `unit`.
 
-    `table` maps t_k and row k of the schedule to values that are common to all cases at a sample. `states`, `inputs`
-    and `residuals` (Residuals or None) are gathered.
+    `table` maps t_k and row k of the schedule, with jets of references below it, to values that are common to all cases
+    at a sample. `states`, `inputs` and `residuals` (Residuals or None) are gathered.
     """
 
     text: str
@@ -60,18 +62,20 @@ def unit(plant, law, disturbed, residuals=None):
     key = (plant.equations, law.measures, disturbed, phi)
     if key not in units:
         units[key] = _derived(plant, law, disturbed, residuals)
-    return units[key]
+    return replace(units[key], residuals=residuals)  # which may follow other paths
 
 
 def _derived(plant, law, disturbed, residuals):
     """Rates, law and residuals in C; parts that depend on the case alone, or on the sample alone, are split off."""
-    n_c, n_u, project = len(plant.parameters), len(plant.inputs), plant.equations.project()
-    t, x, p, rates = _rates(plant, disturbed)
+    n_c, n_u, project = plant.at_u, len(plant.inputs), plant.equations.project()
+    t, x, p, followed, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], *(p[i] for i in disturbed))
     still = ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed))
-    f, w, w_values = _fastest((t, x, p, rates), still, applied)
+    place = p[: n_c - len(plant.parameters)]
+    f, w, w_values = _fastest((t, x, p, rates, followed), place, still, applied)
     t_k, row, written, common_values = _law_in_c(law)
-    phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p), t_k)
+    r = ca.SX.sym("r", len(residuals.jets) if residuals else 0)
+    phi, s, s_values = _apart(_signals(plant, residuals, t_k, x, p, r), ca.vertcat(t_k, r))
     phi, v, v_values = _apart(phi, constants)
     vectors = {"NX": x, "NP": p, "NW": w, "NV": v, "NL": common_values, "NS": s, "NR": phi}
     sizes = {name: vector.numel() for name, vector in vectors.items()}
@@ -94,20 +98,21 @@ def _derived(plant, law, disturbed, residuals):
         _rates_of_block(f),
         written,
         _lanes("signals", t_k, ca.vertcat(x, v), s, phi, emit.LANES_COMMON),
-        "" if project is None else _lanes("change", *project.sx_in(), project(*project.sx_in())),
+        "" if project is None else emit.function(project, "change", emit.LANES),
         emit.include("batch.c"),
     ]
-    table = _function("table", t_k, ca.SX(0, 1), row, ca.vertcat(common_values, s_values))
+    table = _function("table", t_k, ca.SX(0, 1), ca.vertcat(row, r), ca.vertcat(common_values, s_values))
     table = compiled(table, "table")
     return Unit("".join(parts), table, plant.state_names, plant.inputs, residuals)
 
 
-def _signals(plant, residuals, t, x, p):
-    """Residuals of the state x at t."""
+def _signals(plant, residuals, t, x, p, r):
+    """Residuals of the state x at t, with jets of references r."""
     if not residuals:
         return ca.SX(0, 1)
     # a single parameter indexed by [] is a row in CasADi, not a column
-    numbers = ca.vertcat(ca.SX(0, 1), *(p[i] for i in residuals.places))
+    first = plant.at_u - len(plant.parameters)
+    numbers = ca.vertcat(ca.SX(0, 1), *(p[first + i] for i in residuals.places), r)
     return residuals.expression(t, x, plant.state_names, numbers)
 
 
@@ -122,24 +127,25 @@ def _law_in_c(law):
 
 
 def _rates(plant, disturbed):
-    """Symbols t, x and p of a plant, and x' with no generalised force but those that are disturbed."""
+    """Symbols t, x, p and r of a plant, and x' with no generalised force but those that are disturbed."""
     f = plant.function("ode").expression
-    t, x, p = f.sx_in()
-    first = len(plant.parameters) + len(plant.inputs)
+    t, x, p, *r = f.sx_in()
+    first = plant.at_u + len(plant.inputs)
     calm = [i for i in range(first, p.numel()) if i not in disturbed]
-    return t, x, p, ca.substitute(f(t, x, p), p[calm], ca.SX.zeros(len(calm)))
+    return t, x, p, *(r or [ca.SX(0, 1)]), ca.substitute(f(t, x, p, *r), p[calm], ca.SX.zeros(len(calm)))
 
 
-def _fastest(of_all, still, applied):
-    """The rates (t, x, p, x') as a function of (t, x, [w; applied]), symbols w, and their values by symbols `still`.
+def _fastest(of_all, place, still, applied):
+    """The rates (t, x, p, x', r) as a function of (t, x, [w; applied], r), symbols w, and their values by `still`.
 
-    What each case computes once takes no time.
+    What each case computes once takes no time. The place of paths, if any, is the first of w.
     """
-    f, (t, x, p, _) = _function("rates", *of_all), of_all
-    ways = []
-    for rates in (f(t, x, p), *(ca.Function("way", f.sx_in(), [way])(t, x, p) for way in emit.other_ways(f))):
+    f, (t, x, p, _, r) = _function("rates", *of_all), of_all
+    inputs, ways = (t, x, p, r)[: f.n_in()], []
+    for rates in (f(*inputs), *(ca.Function("way", f.sx_in(), [way])(*inputs) for way in emit.other_ways(f))):
         rest, w, values = _apart(rates, still)
-        ways.append((_function("rates", t, x, ca.vertcat(w, applied), rest), w, values))
+        w, values = ca.vertcat(place, w), ca.vertcat(place, values)
+        ways.append((_function("rates", t, x, ca.vertcat(w, applied), rest, r), w, values))
     return min(ways, key=lambda way: emit.cost(way[0], emit.LANES_INLINE))
 
 
@@ -149,8 +155,10 @@ def _apart(expression, symbols):
     return rest, ca.vertcat(ca.SX(0, 1), *new), ca.vertcat(ca.SX(0, 1), *values)
 
 
-def _function(name, t, x, p, value):
-    return ca.Function(name, [t, x, p], [ca.densify(ca.cse(value))])
+def _function(name, t, x, p, value, r=None):
+    """The function (t, x, p), or (t, x, p, r) where there are jets of references."""
+    inputs = {"t": t, "x": x, "p": p} | ({"r": r} if r is not None and r.numel() else {})
+    return ca.Function(name, [*inputs.values()], [ca.densify(ca.cse(value))], [*inputs], ["y"])
 
 
 def _lanes(name, t, x, p, value, dialect=emit.LANES):
@@ -161,7 +169,7 @@ def _lanes(name, t, x, p, value, dialect=emit.LANES):
 def _rates_of_block(f):
     """C text of the rates of the vectors of a block, inlined if they are short."""
     head = "INLINE void rates_of_block(const W t, const W *const x[], const W *const p[], W (*y)[NX + 1])\n{\n"
-    if emit.operations(f) > INLINED:
+    if emit.operations(f) > INLINED or jets_in(f):
         each = (f"    rates(t, x[{g}], p[{g}], y[{g}]);\n" for g in range(VECTORS))
         return emit.function(f, "rates", emit.LANES) + head + "".join(each) + "}\n"
     suffixes = ("", *map(str, range(1, VECTORS)))
@@ -191,7 +199,7 @@ class Gathered:
 def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, step=None):
     """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
-    `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
+    `loop` holds for all cases, without its x0 and noise. `cases` are parameters of the plant (n_c, N), initial
     states (n_x, N) and factors of the disturbances (n_d, N); `noise` are standard deviations of the measurements (n_y,)
     and keys of the cases (N, 2). `step` is the C function of a law that is called.
     `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
@@ -211,7 +219,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, s
     depth = 1 + max(loop.delay, late)
     constants, x0, scale = (part[:, columns] for part in cases)
     deviations, keys = noise or (None, None)
-    given = {"constants": constants, "x0": x0, "scale": scale, "p": None, "table": _common(unit, loop), "depth": depth}
+    given = {"constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "depth": depth}
     given |= {"deviations": deviations, "keys": None if keys is None else keys[columns]}
     given |= {"law": step and ctypes.cast(step, ctypes.c_void_p), "columns": blocks * width, "every": every}
     given |= {"traced": traced, "n_traced": len(traced), "gathered": gathered, "trace": trace}
@@ -236,5 +244,6 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, s
 def _common(unit, loop):
     """The table of values that are common to all cases, a row per sample."""
     samples = np.arange(loop.samples + 1)
-    rows = loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
-    return unit.table.grid(loop.t0 + samples * loop.period, np.zeros((0, len(samples))), rows).T
+    t, rows = loop.t0 + samples * loop.period, loop.table[np.minimum(loop.first + samples, len(loop.table) - 1)].T
+    jets = [unit.residuals.jets.at(t)] if unit.residuals else []
+    return unit.table.grid(t, np.zeros((0, len(samples))), np.vstack([rows, *jets])).T

@@ -123,10 +123,9 @@ def loop_of(plant, law, x0, t_span, conditions):
         n_u=len(plant.inputs),
         n_out=law.n_out,
         first=first,
-        at_u=len(plant.parameters),
+        at_u=plant.at_u,
         t0=t0,
         period=law.period,
-        p=plant.p(),
         x0=x0,
         z0=law.state,
         table=law.schedule.T,
@@ -184,7 +183,7 @@ def require_consistent(plant, t0, starts, p):
 
 def finished(plant, law, plan, loop, conditions, advance=None):
     """Run a loop and return its `Closed`, or raise the error that ended it; `advance` is that of `run_loop`."""
-    status, x, law_x, law_y, inputs = run_loop(plant.function("ode"), law.begin(), loop, advance)
+    status, x, law_x, law_y, inputs = run_loop(plant, law.begin(), loop, advance)
     if status == INTERRUPTED and not len(x):
         raise KeyboardInterrupt
     t = loop.t0 + np.arange(len(x)) * loop.period

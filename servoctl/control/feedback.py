@@ -87,11 +87,10 @@ def affine(name, reference, K, K_i=None, residuals=None, info=None):
 
 
 def integration(reference, residuals):
-    """The schedule of z+ = z + Ts φ: Ts, the parameters of φ and values along the plan at each sample, (1 + n_p, N)."""
-    numbers = np.tile(np.append(reference.period, residuals.parameters)[:, None], len(reference.t))
-    for row, name in enumerate(residuals.planned, start=len(numbers) - len(residuals.planned)):
-        numbers[row] = reference.planned(name)
-    return numbers
+    """The schedule of z+ = z + Ts φ: Ts, the parameters of φ and what is planned at each sample, (1 + n_p, N)."""
+    constant = np.append(reference.period, residuals.parameters[: len(residuals.places)])
+    planned = [reference.planned(name) for name in residuals.planned]
+    return np.vstack([np.tile(constant[:, None], len(reference.t)), *planned, residuals.jets.at(reference.t)])
 
 
 def integral_names(residuals):

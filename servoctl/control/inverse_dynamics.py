@@ -16,7 +16,7 @@ from servoctl.checks import as_complex, by_name, is_number, positive, whole
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, of_plan, refuse_transport
-from servoctl.control.residuals import in_symbols_of
+from servoctl.control.residuals import in_symbols_of, paths_along
 from servoctl.control.sampling import sampled_radii
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics
 from servoctl.growth import internal_dynamics
@@ -27,6 +27,7 @@ from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
 from servoctl.reduction.realisation import desired_actuation
 from servoctl.run import Run
+from servoctl.spec.references import Jets
 
 PLAN_POINTS = 129  # states of the plan at which a choice of rows must be regular
 WEAK = 0.05  # of its largest size along the plan: a smaller determinant is no choice of rows
@@ -46,7 +47,8 @@ def linearise(plan, plant):
     _require_invertible(plan.model.reduction, plant)
     along = np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS)
     points = _points(plan, plant), (along, _plant_states(plan, plant, along))
-    extension = _Extension(plant, in_symbols_of(plant, plan.model), *points)
+    residuals, paths = in_symbols_of(plant, plan.model), paths_along(plan.model, plant)
+    extension = _Extension(plant, residuals, paths, *points)
     reduction = plan.model.reduction
     split, wish = reduction.realisation.actuation, desired_actuation(reduction.mechanism, reduction.program)
     if split.shape[0] > split.shape[1] and reduction.mechanism.q.order(split) < 2:
@@ -112,9 +114,10 @@ class _Extension:
     `relative_degree` are the orders of the residuals without the extension.
     """
 
-    def __init__(self, plant, residuals, points, along):
+    def __init__(self, plant, residuals, paths, points, along):
         e = plant.equations
-        q, self.parameters = e.q, plant.parameters
+        q, self.parameters, self._paths = e.q, plant.parameters, paths
+        self.q = q
         self.t, self.x, self.names, self.points, self.along = q.t, e.state, tuple(residuals), points, along
         self.numbers = e.p[: e.p.numel() - e.u.numel() - q.n]
         undisturbed = [ca.substitute(part, e.d, ca.SX.zeros(q.n)) for part in (e.state_rates, e.acceleration)]
@@ -136,7 +139,9 @@ class _Extension:
 
     def _rate(self, expression):
         """The total derivative along the extended plant."""
-        variables, rates = ca.vertcat(self.t, self.x, self.xi), ca.vertcat(1, self.x_rate, self.xi_rate)
+        jets = Jets(self.q, [expression])
+        variables = ca.vertcat(self.t, self.x, self.xi, jets.symbols)
+        rates = ca.vertcat(1, self.x_rate, self.xi_rate, jets.rates)
         return ca.cse(ca.jtimes(expression, variables, rates))
 
     def _differentiate(self, level):
@@ -164,8 +169,9 @@ class _Extension:
     def _at(self, matrix, times, states, xi):
         v = np.zeros((len(times), self.v.numel()))
         numbers = np.tile(self.parameters, (len(times), 1))
-        inputs = np.concatenate([times[:, None], states, xi, v, numbers], axis=1).T
-        symbols = ca.vertcat(self.t, self.x, self.xi, self.v, self.numbers).elements()
+        jets = self.jets([matrix])
+        inputs = np.concatenate([times[:, None], states, xi, v, numbers, jets.at(times).T], axis=1).T
+        symbols = ca.vertcat(self.t, self.x, self.xi, self.v, self.numbers, jets.symbols).elements()
         tape = Tape(symbols, ca.densify(ca.vec(matrix)).elements())
         shape = (matrix.shape[1], matrix.shape[0], len(times))
         return tuple(a.reshape(shape).swapaxes(0, 1) for a in evaluate(tape, inputs.astype(np.longdouble)))
@@ -175,13 +181,18 @@ class _Extension:
         xi = np.zeros((len(times), self.xi.numel()))
         if self.turns:
             levels = ca.vertcat(*(e for level in self.levels for e in level[:-1]))
-            symbols = [self.t, self.x, self.xi, self.numbers]
+            jets = self.jets([levels])
+            symbols, r = [self.t, self.x, self.xi, self.numbers, jets.symbols], jets.at(times).T
             f = ca.Function("levels", symbols, [levels, ca.densify(ca.jacobian(levels, self.xi))])
             for k, (t, x) in enumerate(zip(times, states, strict=True)):
                 for _ in range(LEVEL_STEPS):
-                    values, slopes = f(t, x, xi[k], self.parameters)
+                    values, slopes = f(t, x, xi[k], self.parameters, r[k])
                     xi[k] -= np.linalg.lstsq(np.array(slopes), np.array(values)[:, 0], rcond=None)[0]
         return xi
+
+    def jets(self, expressions):
+        """The jets of references in expressions, along the paths of the plan."""
+        return Jets(self.q, expressions, self._paths)
 
     @property
     def decoupling(self):
@@ -297,9 +308,9 @@ class _Extension:
         self.levels = [[next(rest) for _ in level] for level in self.levels]
 
     def step(self):
-        """The linearisation by a decoupling matrix of full rank: (t, [x; ξ], column) -> [u; ξ+].
+        """The linearisation by a decoupling matrix of full rank: (t, [x; ξ], column) -> [u; ξ+]; jets of references.
 
-        The column is [plant's parameters; Ts; increment of u; coefficients of the error dynamics].
+        The column is [plant's parameters; Ts; increment of u; coefficients of the error dynamics; these jets].
         """
         D, c = self.decoupling, [ca.SX.sym(f"c_{name}", order) for name, order in self.orders.items()]
         tops = [ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape)) for level in self.levels]
@@ -307,9 +318,10 @@ class _Extension:
         target = -ca.vertcat(*(top + error for top, error in zip(tops, errors, strict=True)))
         self._substitute(self.v, self._solved(D, target))
         period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
-        column = ca.vertcat(self.numbers, period, ahead, *c)
         outputs = [self.u + ahead, self._advanced(period)]
-        return law_step("computed", self.t, ca.vertcat(self.x, self.xi), column, outputs)
+        jets = self.jets(outputs)
+        column = ca.vertcat(self.numbers, period, ahead, *c, jets.symbols)
+        return law_step("computed", self.t, ca.vertcat(self.x, self.xi), column, outputs), jets
 
     def _solved(self, D, target):
         """v with D v = target: the only one, or the one of least norm, of the inputs if they still have to share."""
@@ -389,7 +401,10 @@ def computed(
     for name, values in poles.items():
         _require_slow(name, values, reference.rate, delay)
     coefficients = [np.poly(values).real[:0:-1] for values in poles.values() if len(values)]
-    columns = ([plant.parameters, [reference.period], u, *coefficients] for u in reference.ahead(delay).T)
+    state = linear.controller_states(*(values[:1] for values in linear.along))[0]
+    step, jets = linear.step()
+    rows = zip(reference.ahead(delay).T, jets.at(reference.t).T, strict=True)
+    columns = ([plant.parameters, [reference.period], u, *coefficients, r] for u, r in rows)
     info = {"orders": linear.orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {order}" for name, order in linear.orders.items())
     return Law(
@@ -398,9 +413,9 @@ def computed(
         inputs=plant.inputs,
         rate=reference.rate,
         t0=float(plan.t[0]),
-        step=linear.step(),
+        step=step,
         schedule=np.column_stack([np.concatenate(column) for column in columns]),
-        state=linear.controller_states(*(values[:1] for values in linear.along))[0],
+        state=state,
         state_names=tuple(linear.state_names),
         initial_input=reference.initial_input,
         plan=plan,
@@ -410,9 +425,30 @@ def computed(
 
 def _require_smooth(plan, orders):
     """Refuse paths with fewer derivatives than the error dynamics need."""
-    reduction = plan.model.reduction
+    reduction, q = plan.model.reduction, plan.model.reduction.mechanism.q
+    for name, residual in reduction.program.residuals.items():
+        for reference, k in Jets(q, [residual]).places:
+            _require_class(plan, name, orders.get(name, 0) + k, reference)
     if reduction.timed and any(order > reduction.needs.get(name, 0) for name, order in orders.items()):
         require_smooth(reduction.switches, plan.model.parameters, orders, (plan.t[0], plan.t[-1]))
+
+
+def _require_class(plan, name, order, reference):
+    """Refuse a path with fewer continuous derivatives than a residual's error dynamics need."""
+    path = plan.model.paths[reference].held()
+    if len(rough := path.breaks_below(order, plan.t[0], plan.t[-1])):
+        has = int(path.classes[np.searchsorted(path.breaks, rough[0])])
+        raise SpecificationError(
+            f"The path of {reference!r} in {name!r} needs C^{order}, has {f'C^{has}' if has >= 0 else 'a jump'} at "
+            f"t = {rough[0]:.6g}.",
+            f"The command contains its derivative {order}, which must be continuous.",
+            do=f"Use sv.paths.rest_to_rest(..., smoothness={order}), or a spline of that class.",
+            name=name,
+            reference=reference,
+            needs=order,
+            has=has,
+            t=float(rough[0]),
+        )
 
 
 def _require_stable(plan):

@@ -17,7 +17,7 @@ from servoctl.control.close import require_names
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, of_plan, require_plant
-from servoctl.control.residuals import Residuals, in_symbols_of, program_residuals
+from servoctl.control.residuals import Residuals, in_symbols_of, paths_along, program_residuals
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest
@@ -25,6 +25,7 @@ from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.jets.branches import cse
 from servoctl.markup import Shown
 from servoctl.plants.plant import Plant
+from servoctl.spec.references import Jets
 from servoctl.tolerances import TINY
 from servoctl.values import Value, frozen
 
@@ -41,9 +42,12 @@ SCENE = frozenset(("t_span", "start", "guess", "parameters"))  # arguments of `f
 
 
 class Effects:
-    """The immediate effects of inputs: o = c + O u for expressions of t, q, γ' and γ'', affine in the inputs."""
+    """The immediate effects of inputs: o = c + O u for expressions of t, q, γ' and γ'', affine in the inputs.
 
-    def __init__(self, plant, expressions):
+    `jets` are those of references in them, along `paths` by name.
+    """
+
+    def __init__(self, plant, expressions, paths):
         self.names, self._plant = tuple(expressions), plant
         e = plant.equations
         values = ca.vertcat(ca.SX(0, 1), *expressions.values())
@@ -60,15 +64,16 @@ class Effects:
             )
         self.immediate = {name for i, name in enumerate(self.names) if slopes[i, :].nnz()}  # an input changes these
         still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
-        numbers = e.p[: e.p.numel() - e.u.numel() - e.q.n]
         parts = ca.densify(cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
+        self.jets = Jets(e.q, [parts], paths)
+        numbers = ca.vertcat(e.p[: e.p.numel() - e.u.numel() - e.q.n], self.jets.symbols)
         self.expression = ca.Function("effects", [e.q.t, e.state, numbers], [parts])
         self._function = compiled(self.expression, "effects")
 
-    def __call__(self, t, x):
-        """c (j,) and O (j, m) at a state x (n_x,)."""
+    def __call__(self, t, x, r):
+        """c (j,) and O (j, m) at a state x (n_x,), with the jets of references r (n_r,)."""
         j, m = len(self.names), len(self._plant.inputs)
-        y = self._function(t, x, self._plant.parameters)
+        y = self._function(t, x, np.append(self._plant.parameters, r))
         return y[:j], y[j:].reshape(m, j).T
 
 
@@ -132,12 +137,14 @@ def limited(
     sizes = _sizes(law.plan, plant, H)
     allocation = Allocation(law, plant, effects, bounds, tuple(weights), sizes, np.abs(D).max(axis=0) @ sizes)
     low, high, change = conditions.limits(plant, law.period)
-    numbers = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])  # finite in a schedule
+    constant = np.concatenate([low, high, change, sizes, *bounds.T, plant.parameters])
+    numbers = np.tile(np.nan_to_num(constant)[:, None], len(reference.t))  # finite in a schedule
+    numbers = np.vstack([numbers, effects.jets.at(reference.t)])
     return replace(
         law,
         name=f"{law.name}, limited " + (f"by priority {' > '.join(priority)}" if priority else "by weight"),
         step=allocation,
-        schedule=_schedule(law, reference, D, H, np.nan_to_num(numbers)),
+        schedule=_schedule(law, reference, D, H, numbers),
         state=np.concatenate([law.state, np.clip(law.initial_input, low, high)]),
         state_names=(*law.state_names, *(f"last {name}" for name in plant.inputs)),
         signals=(*law.signals, *allocation.signals),
@@ -161,7 +168,7 @@ def _bounds(plant, bounds):
     for one in (one for combination, _ in parts.values() for one in combination):
         named(one, known, "output or multiplier")
     rows = {name: sum(c * known[one] for one, c in combination.items()) for name, (combination, _) in parts.items()}
-    effects = Effects(plant, rows)
+    effects = Effects(plant, rows, plant.paths)
     for name in bounds:
         if name not in effects.immediate:
             raise SpecificationError(
@@ -189,7 +196,7 @@ def _schedule(law, reference, D, H, numbers):
     count = len(D)
     along = np.vstack([reference.x, D.reshape(count, -1).T, H.reshape(count, -1).T])
     matrix = [] if law.input_matrix is None else [law.input_matrix.reshape(len(law.input_matrix), -1).T]
-    parts = (law.schedule, numbers[:, None], *matrix, along)
+    parts = (law.schedule, numbers, *matrix, along)
     samples = np.arange(max(count, law.schedule.shape[1]))
     return np.vstack([part[:, np.minimum(samples, part.shape[1] - 1)] for part in parts])
 
@@ -256,14 +263,17 @@ def _at_once(reference, others):
                 name=name,
                 order=order,
             )
-    effects = Effects(plant, second)
-    slopes = np.array([effects(t, x)[1] for t, x in zip(reference.t, reference.x.T, strict=True)])
+    effects = Effects(plant, second, paths_along(plan.model, plant))
+    along = zip(reference.t, reference.x.T, effects.jets.at(reference.t).T, strict=True)
+    slopes = np.array([effects(*at)[1] for at in along])
     return {name: slopes[:, i] for i, name in enumerate(second)}
 
 
 @frozen(eq=False)
 class Allocation(Value):
     """The step of a limited law: (t, [y; z; last u], [column; numbers; x_ref; D; H]) -> [u; z+; u; signals].
+
+    The numbers are limits, sizes, bounds, the plant's parameters, and jets of references in the bounded outputs.
 
     `law` is the law without limits, `plant` the plant with them; `effects` are those of the inputs on the bounded
     outputs, `bounds` (j, 2). `residuals` may have slack; `sizes` (m,) are typical sizes of the inputs, `slack_sizes`
@@ -295,6 +305,12 @@ class Allocation(Value):
     def measured(self):
         """Indices of the measured states."""
         return [self.plant.state_names.index(name) for name in self.law.measures]
+
+    @cached_property
+    def _jets(self):
+        """Where a column has the jets of references in the bounded outputs."""
+        begin = len(self.law.schedule) + 4 * len(self.sizes) + 2 * len(self.bounds) + len(self.plant.parameters)
+        return slice(begin, begin + len(self.effects.jets))
 
     @cached_property
     def _limits(self):
@@ -340,7 +356,7 @@ class Allocation(Value):
             "NROW": law.schedule.shape[0],
             "NK": len(self.residuals),
             "NJ": len(self.bounds),
-            "NC": len(self.plant.parameters),
+            "NC": len(self.plant.parameters) + len(self.effects.jets),
             "NI": len(law.integrators),
             "QP_STEPS": STEPS,
             "QP_MET": WITHIN,
@@ -361,7 +377,7 @@ class Allocation(Value):
         state[self.measured] = y
         low, high, change = self._limits
         low, high = np.maximum(low, last - change), np.minimum(high, last + change)
-        c, O = self.effects(t, state)
+        c, O = self.effects(t, state, column[self._jets])
         u = self._allocate(t, desired, low, high, H, c, O)
         difference = u - desired
         slack = D @ difference

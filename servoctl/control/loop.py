@@ -30,7 +30,6 @@ class Loop(Value):
     at_u: int  # index of the first input in p
     t0: float  # [s]
     period: float  # [s]
-    p: np.ndarray
     x0: np.ndarray
     z0: np.ndarray  # initial controller state
     table: np.ndarray  # gain schedule, a row per sample; the last row holds after the end
@@ -86,18 +85,18 @@ class Arguments(ctypes.Structure):
 _STEP = ctypes.CFUNCTYPE(None, ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)
 
 
-def run_loop(ode, law, loop, advance=None):
+def run_loop(plant, law, loop, advance=None, rates="ode"):
     """Run a closed loop: in C, which calls a law in Python back, or in Python without a compiler.
 
     `advance`, of the arguments of `hold`, advances the state by a sample in place of the plant's equations.
 
-    `ode` are the plant's rates, compiled with the loop "closed"; `law` maps (t, [y; z], row of the schedule) to
-    [u; z+; signals]. Returns the status (FINISHED; STATE_LOST or LAW_LOST if the state or the law's output is not
-    finite at the next sample; INTERRUPTED by Ctrl-C; or the error that the law raised), and at the N completed samples
-    the states (N, n_x), measurements and controller states (N, n_y + n_z), outputs of the law (N, n_out) and inputs
-    (N, n_u).
+    `rates` names a function of the plant that is compiled with the loop "closed"; `law` maps (t, [y; z], row of the
+    schedule) to [u; z+; signals]. Returns the status (FINISHED; STATE_LOST or LAW_LOST if the state or the law's output
+    is not finite at the next sample; INTERRUPTED by Ctrl-C; or the error that the law raised), and at the N completed
+    samples the states (N, n_x), measurements and controller states (N, n_y + n_z), outputs of the law (N, n_out) and
+    inputs (N, n_u).
     """
-    n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
+    ode, p, n, n_y, n_z = plant.function(rates), plant.p(), loop.samples + 1, len(loop.measured), len(loop.z0)
     native = ode.native("closed", 4 * loop.samples * loop.substeps) if advance is None else None
     exact = native is not None and not n_z and loop.noise is None and loop.quantum is None  # the law gets states
     logs = {
@@ -107,9 +106,9 @@ def run_loop(ode, law, loop, advance=None):
         "input": np.empty((n, loop.n_u)),
     }
     if native is None:
-        done, status = _interpreted(ode, law, loop, advance or hold, logs)
+        done, status = _interpreted((ode, p, advance or hold), law, loop, logs)
     else:
-        done, status = _native(native, law, loop, logs)
+        done, status = _native(native, law, loop, logs | {"p": p})
     if exact:
         logs["law_x"] = _by_columns(logs["x"], loop.measured)
     return status, *(log[:done] for log in logs.values())
@@ -214,11 +213,11 @@ def hold(ode, t, x, steps):
     return x
 
 
-def _steps(c, k, inputs):
+def _steps(c, p, k, inputs):
     """Begin after the sample k and length of each step [s], parameters at its start, middle and end."""
     late, h = 0 if c.transport is None else c.transport, c.period / c.substeps
     for s in range(c.substeps):
-        stages = np.tile(c.p, (3, 1))
+        stages = np.tile(p, (3, 1))
         applied = k - samples_ago(s, late, c.substeps) + np.zeros(c.n_u, dtype=int)
         stages[:, c.at_u : c.at_u + c.n_u] = np.where(applied < 0, c.initial_input, inputs[applied, range(c.n_u)])
         step = k * c.substeps + s
@@ -230,9 +229,12 @@ def _steps(c, k, inputs):
 
 
 @np.errstate(all="ignore")
-def _interpreted(ode, law, c, advance, logs):
-    """The loop of closed.c in Python; returns the number of completed samples and the status."""
-    x_log, law_x, law_y, inputs = logs.values()
+def _interpreted(plant, law, c, logs):
+    """The loop of closed.c in Python; returns the number of completed samples and the status.
+
+    Of the plant there are its rates, its numbers and what advances its state.
+    """
+    (ode, p, advance), (x_log, law_x, law_y, inputs) = plant, logs.values()
     n_y, n_z, n_u, x = len(c.measured), len(c.z0), c.n_u, c.x0
     law_x[0, n_y:] = c.z0
     for k in range(c.samples + 1):
@@ -253,7 +255,7 @@ def _interpreted(ode, law, c, advance, logs):
             break
         law_x[k + 1, n_y:] = law_y[k, n_u : n_u + n_z]
         try:
-            x = advance(ode, t, x, _steps(c, k, inputs))
+            x = advance(ode, t, x, _steps(c, p, k, inputs))
         except KeyboardInterrupt:
             return k + 1, INTERRUPTED
     return c.samples + 1, FINISHED

@@ -1,14 +1,16 @@
 """Residuals of a program as functions of a plant's state, matched by name."""
 
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import named, rows_read
 from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError, unknown
 from servoctl.jets.branches import cse
+from servoctl.spec.references import Jets, function_of, orders_in
 
 
 class Residuals:
@@ -22,12 +24,14 @@ class Residuals:
     names, orders : tuple
         Names and orders of the residuals.
     expressions, symbols : SX, list of SX
-        The residuals in the plant's symbols, and the parameters on which they depend; values along the plan are the
-        last of them.
+        The residuals in the plant's symbols, and the parameters on which they depend, followed by values along the
+        plan and by jets of references.
     places : tuple of int
         Indices of these parameters among those of the plant.
     parameters : (n_p,) array
-        The plant's numbers of these parameters, 0 for values along the plan.
+        The plant's numbers of these parameters, 0 for values along the plan and for jets of references.
+    jets : Jets
+        The jets of references, which `expression` takes as numbers: laws have them in their schedule.
     planned : tuple of str
         Names of the residuals that are deviations from the plan.
     measures : tuple of str
@@ -62,8 +66,10 @@ class Residuals:
         self._q, self._state, self._order = plant.mechanism.q, plant.equations.state, order
         parameters = plant.mechanism.parameters.symbols
         self.places = tuple(i for i, s in enumerate(parameters) if ca.depends_on(self.expressions, s))
-        self.symbols = [*(parameters[i] for i in self.places), *along.values()]
-        self.parameters = np.append(plant.parameters[list(self.places)], np.zeros(len(along)))
+        self.paths = paths_along(model, plant)
+        self.jets = Jets(self._q, [self.expressions], self.paths)
+        self.symbols = [*(parameters[i] for i in self.places), *along.values(), *self.jets.symbols.elements()]
+        self.parameters = np.append(plant.parameters[list(self.places)], np.zeros(len(along) + len(self.jets)))
         self.planned = tuple(along)
         states = zip(plant.state_names, self._state.elements(), strict=True)
         self._measured = {name: s for name, s in states if ca.depends_on(self.expressions, s)}
@@ -77,13 +83,26 @@ class Residuals:
         return ca.substitute(self.expressions, ca.vertcat(*old), ca.vertcat(*new))
 
     def _function(self, name, outputs):
-        """A compiled function of (t, states, parameters), with accelerations below the states for order 2."""
+        """A compiled function of (t, states, p), with accelerations below the states for order 2."""
         if name not in self._built:
             x = ca.vertcat(self._state, *(self._q.gamma(2) if self._order > 1 else ()))
-            y = ca.densify(cse(ca.vertcat(*outputs())))
-            f = ca.Function(name, [self._q.t, x, ca.vertcat(ca.SX(0, 1), *self.symbols)], [y])
+            y, p = ca.densify(cse(ca.vertcat(*outputs()))), self.symbols[: len(self.symbols) - len(self.jets)]
+            f = function_of(self._q, self._names, name, x, ca.vertcat(ca.SX(0, 1), *p), y)
             self._built[name] = compiled(f, name)
         return self._built[name]
+
+    @cached_property
+    def _names(self):
+        return tuple(orders_in(self._q, [self.expressions]))
+
+    @cached_property
+    def _p(self):
+        """The parameters of compiled functions, after the place of the paths that references follow."""
+        numbers = self.parameters[: len(self.parameters) - len(self.jets)]
+        if not self._names:
+            return numbers
+        self._followed = Followed([self.paths[name].held() for name in self._names])
+        return np.append(self._followed.address, numbers)
 
     def levels(self, t, x):
         """Residuals, and the derivative of those of order 0: (2, N) and (1, N) arrays by name.
@@ -99,7 +118,7 @@ class Residuals:
                 for level in self._q.derivatives([e], max(1 - order, 0))
             ]
 
-        values = self._function("residual_levels", outputs).grid(t, x, self.parameters)
+        values = self._function("residual_levels", outputs).grid(t, x, self._p)
         counts = [max(2 - order, 1) for order in self.orders]
         ends = np.cumsum([0, *counts])
         return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
@@ -110,8 +129,13 @@ class Residuals:
         def outputs():
             return [ca.vec(ca.densify(ca.jacobian(self.expressions, self._state)))]
 
-        values = self._function("residual_jacobian", outputs).grid(t, x, self.parameters)
+        values = self._function("residual_jacobian", outputs).grid(t, x, self._p)
         return values.reshape(-1, len(self.names), len(t)).transpose(2, 1, 0)
+
+
+def paths_along(model, plant):
+    """The paths of all references of a program at a plant, by name: of its own it has other paths, as parameters."""
+    return model.paths | plant.paths
 
 
 def _planned(mechanism):
@@ -146,7 +170,11 @@ def in_symbols_of(plant, model, expressions=None):
     names = [name for name, symbol in old.items() if ca.depends_on(every, symbol)]
     for name in names:
         named(name, new, "state or parameter of the plant")
-    old, new = (ca.vertcat(ca.SX(0, 1), *(symbols[name] for name in names)) for symbols in (old, new))
+    jets, family = Jets(mechanism.q, [every]), plant.mechanism.q.family
+    for name, _ in jets.places:
+        named(name, family.names, "reference of the plant's coordinates")
+    old = ca.vertcat(*(old[name] for name in names), jets.symbols)
+    new = ca.vertcat(*(new[name] for name in names), *(family.jet(*place) for place in jets.places), ca.SX(0, 1))
     return {name: ca.substitute(e, old, new) for name, e in expressions.items()}
 
 

@@ -29,7 +29,7 @@ from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.manifold import jet_of_reference
+from servoctl.reduction.manifold import references_at
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
@@ -266,11 +266,7 @@ class Model(Detailed):
 
     def references_at(self, t):
         """Derivatives of the references at an instant, by names as points near a state have them."""
-        found = {}
-        for name, path in zip(self.paths, self._followed.paths, strict=True) if self.paths else ():
-            jets = path.jets([t], path.coefficients.shape[2] - 1)[:, 0, 0]
-            found |= {jet_of_reference(name, k): value for k, value in enumerate(jets.tolist()[: JETS + 1])}
-        return found
+        return references_at(required_paths(self.paths), t)
 
     def _holds(self, values):
         """Whether every decision of the derivation is the same with other parameters."""

@@ -36,6 +36,7 @@ def driven(plant, inputs=None, residuals=None):
     damping = ca.SX(list(plant.parameters[count : count + plant.equations.damping.numel()]))
     further = plant.equations.forces + ca.substitute(plant.equations.resisting, plant.equations.damping, damping)
     model = derive(mechanism.under(expressions, further, residuals), no_program())
+    model = model.with_references(**{name: path for name, path in plant.paths.items() if name in model.paths})
     return model.with_parameters(**dict(zip(mechanism.parameters.names, plant.parameters[:count], strict=True)))
 
 

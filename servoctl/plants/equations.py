@@ -14,10 +14,12 @@ from servoctl.jets.branches import cse
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.manifold import Context, sample
+from servoctl.reduction.manifold import Context, follows, sample
 from servoctl.reduction.orders import Orders
-from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, strong
+from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, references, strong
 from servoctl.reduction.rows import as_rows
+from servoctl.spec.program import no_program
+from servoctl.spec.references import Jets, called, function_of
 from servoctl.values import Identity
 
 LATEST = 32  # plants whose equations stay in memory
@@ -27,10 +29,12 @@ CLEAR = 1e-6  # a mass matrix with unit diagonal and a larger least eigenvalue i
 class PlantEquations:
     """Expressions of the state x = (q, γ', lagged inputs) and of p = (parameters, damping, 1/lag, u, d).
 
-    Further generalised `forces` (n,) are a serialised function (see `Coordinates.as_function`), "" for none; `damped`
-    and `lagged` are indices of velocities with viscous damping and of actuators that lag behind their command. Orders
-    and pivots are decided at the parameters `values`, by default those of the mechanism; `choices` are these four. In
-    `others` are the same equations with pivots that were decided near states where these vanish.
+    Where they contain references, whose names are `references`, the p of functions begins with the place of the paths
+    that a plant follows. Further generalised `forces` (n,) are a serialised function (see `Coordinates.as_function`),
+    "" for none; `damped` and `lagged` are indices of velocities with viscous damping and of actuators that lag behind
+    their command. Orders and pivots are decided at the parameters `values`, by default those of the mechanism;
+    `choices` are these four. In `others` are the same equations with pivots that were decided near states where these
+    vanish.
     """
 
     def __init__(self, mechanism, forces, damped, lagged, values=None, context=None):
@@ -41,6 +45,7 @@ class PlantEquations:
         self._context = Context(parameters, self.values, WINDOW, {}) if context is None else context
         self.functions, self.others = {}, []
         self.forces = _expression(forces, mechanism)
+        self.references = references(mechanism, no_program(), [self.forces])
         self.velocity = ca.vertcat(*q.gamma(1))
         self.lagging = ca.SX.sym("lagging", len(lagged))
         self.state = ca.vertcat(*q, self.velocity, self.lagging)
@@ -56,9 +61,9 @@ class PlantEquations:
 
     def function(self, name, outputs, x=None, p=None):
         """An SX function of (t, x, p) with one dense column."""
-        inputs = [self.q.t, self.state if x is None else x, self.p if p is None else p]
-        f = ca.Function(name, inputs, [ca.densify(cse(ca.vertcat(*outputs)))])
-        return ca.Function(name, f.sx_in(), [ca.densify(cse(folded(f)))], ["t", "x", "p"], ["y"])
+        x, p, y = self.state if x is None else x, self.p if p is None else p, ca.densify(cse(ca.vertcat(*outputs)))
+        f = function_of(self.q, self.references, name, x, p, y)
+        return ca.Function(name, f.sx_in(), [ca.densify(cse(folded(f)))], f.name_in(), ["y"])
 
     @cached_property
     def _material(self):
@@ -68,11 +73,15 @@ class PlantEquations:
         require_inertia(m, rows, points)
         return rows, points
 
-    def near(self, t, x, values):
-        """The same equations with orders and pivots decided near a state x (n_x,) at t [s], with these parameters."""
+    def near(self, t, x, values, followed):
+        """The same equations with orders and pivots decided near a state x (n_x,) at t [s], with these parameters.
+
+        `followed` are values of jets of references there, by name.
+        """
         state = dict(zip((*self.q.names, *self.q.jet_names(1)), map(float, x), strict=False))
         parameters, window = self.mechanism.parameters.symbols, (t - NEARBY, t + NEARBY)
-        context = Context(parameters, np.array(values), window, state, NEAR_SPREAD)
+        jets = follows(self.q, followed)
+        context = Context(parameters, np.array(values), window, state, NEAR_SPREAD, followed=jets)
         return PlantEquations(self.mechanism, *self.choices[:-1], tuple(values), context)
 
     def require_inertia(self, values):
@@ -122,10 +131,13 @@ class PlantEquations:
 
     def _at_points(self, matrix):
         """A function of parameters (n_p, N): the entries of a matrix in each case and at each point, (n, N, points)."""
-        points, symbols = self._material[1], ca.vertcat(*self.mechanism.parameters.symbols)
-        state = ca.vertcat(*self.q, self.velocity)
-        f = Interpreter(self.function("at_points", ca.vertsplit(ca.vec(ca.densify(matrix))), state, symbols))
+        points, jets = self._material[1], Jets(self.q, [matrix])
+        state = ca.vertcat(*self.q, self.velocity, jets.symbols)
+        p, y = ca.vertcat(*self.mechanism.parameters.symbols), ca.densify(ca.vec(matrix))
+        f = ca.Function("at_points", [self.q.t, state, p], [ca.densify(cse(y))])
+        f = Interpreter(ca.Function("at_points", f.sx_in(), [ca.densify(cse(folded(f)))]))
         t, x = np.asarray(points.t, dtype=float), np.vstack([points.jet(0), points.jet(1)]).astype(float)
+        x = np.vstack([x, jets.of(points.instants)])
 
         def values(cases):
             n, y = cases.shape[1], np.empty((matrix.numel(), len(t) * cases.shape[1]))
@@ -257,7 +269,9 @@ class PlantEquations:
         """The mechanism's named outputs; for those of order 3 and above inputs and disturbances are held."""
         outputs, jets = list(self.mechanism.outputs.values()), [self.acceleration]
         for _ in range(2, max(map(self.q.order, outputs), default=0)):
-            jets.append(ca.jacobian(jets[-1], self.q.t) + ca.jtimes(jets[-1], self.state, self.state_rates))
+            followed = Jets(self.q, [jets[-1]])
+            symbols, rates = ca.vertcat(self.state, followed.symbols), ca.vertcat(self.state_rates, followed.rates)
+            jets.append(ca.jacobian(jets[-1], self.q.t) + ca.jtimes(jets[-1], symbols, rates))
         symbols = ca.vertcat(*(s for k in range(2, 2 + len(jets)) for s in self.q.gamma(k)))
         return self.function("outputs", [ca.substitute(e, symbols, ca.vertcat(*jets)) for e in outputs])
 
@@ -282,14 +296,14 @@ class PlantEquations:
             return None
         f = self._invariants.project()
         n = f.numel_in(1)
-        change = f(self.q.t, self.state[:n], self.p[: f.numel_in(2)])
+        change = called(self.q, self.references, f, self.state[:n], ca.vertcat(*self.mechanism.parameters.symbols))
         untouched = ca.SX.zeros(self.lagging.numel() + extra)
         return self.function("project", [change, untouched], ca.vertcat(self.state, ca.SX.sym("extra", extra)))
 
     @cached_property
     def _invariants(self):
         rows, points = self._material
-        return Invariants(self.mechanism, rows, 2, points)
+        return Invariants(self.mechanism, rows, 2, points, references=self.references)
 
 
 def _expression(forces, mechanism):

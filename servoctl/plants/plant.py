@@ -1,6 +1,7 @@
 """The plant: the full mechanism with its parameters, friction, actuators and their limits."""
 
 from dataclasses import field, fields, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -18,11 +19,14 @@ from servoctl.checks import (
     require_kind,
 )
 from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.jets.overflow import settled
 from servoctl.markup import Shown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
+from servoctl.reduction.manifold import references_at
 from servoctl.spec.mechanism import Mechanism, require_known
+from servoctl.spec.references import followed_path, required_paths
 from servoctl.values import Value, frozen
 
 
@@ -106,6 +110,7 @@ def _made(mechanism, parameters, forces, damping, limits=None, rate_limits=None,
         lag,
         {n: d for n, d in delay.items() if d},
         damping,
+        {name: mechanism.q.family.paths[name] for name in equations.references},
         equations,
     )
 
@@ -131,13 +136,14 @@ def part_of(whole, mechanism):
 def made_again(whole, mechanism, **of_actuators):
     """The plant of a mechanism with the forces, damping and parameters of a whole one."""
     forces = dict(zip(whole.disturbable, whole.equations.forces.elements(), strict=True))
-    return _made(
+    again = _made(
         mechanism,
         dict(zip(mechanism.parameters.names, whole.parameters.tolist(), strict=False)),
         {name: forces[name] for name in mechanism.q.force_names if not forces[name].is_zero()},
         {name: c for name, c in whole.damping.items() if name in mechanism.q.force_names},
         **of_actuators,
     )
+    return again.with_references(**{name: whole.paths[name] for name in again.paths})
 
 
 @frozen(eq=False)
@@ -157,6 +163,8 @@ class Plant(Value, Shown):
         Names of the generalised forces that disturbances can act on: of the coordinates or quasi-velocities.
     limits : dict of str to (float, float)
     rate_limits, lag, delay, damping : dict of str to float
+    paths : dict of str to Path
+        Paths of the references in the mechanism's own equations, such as those of a moving support or of the wind.
     """
 
     mechanism: Mechanism
@@ -169,6 +177,7 @@ class Plant(Value, Shown):
     lag: dict
     delay: dict
     damping: dict
+    paths: dict
     equations: PlantEquations = field(repr=False, compare=False)
 
     def __eq__(self, other):
@@ -195,8 +204,44 @@ class Plant(Value, Shown):
         """Whether the state has invariants: material constraints or those of the kinematics."""
         return self.equations.constrained
 
+    def with_references(self, **paths) -> "Plant":
+        """The same plant along other paths of the references in its own equations; nothing is derived.
+
+        Parameters
+        ----------
+        **paths : Path
+            Of one component each, by the names of the references; what SciPy makes is one, too.
+
+        Returns
+        -------
+        Plant
+
+        Raises
+        ------
+        NameUnknown
+            For a name that is no reference of the mechanism's equations.
+        SpecificationError
+            For what is no path of one component.
+        """
+        changes = by_name(paths, self.paths, "reference", "The references")
+        return replace(self, paths=self.paths | {name: followed_path(name, path) for name, path in changes.items()})
+
+    @cached_property
+    def _followed(self):
+        return Followed([path.held() for path in required_paths(self.paths).values()])
+
+    @property
+    def place(self):
+        """The place in memory of the paths that are followed, at which p begins: (1,), or (0,) without references."""
+        return np.array([self._followed.address] if self.paths else [])
+
+    @property
+    def at_u(self):
+        """The index of the first input in p."""
+        return bool(self.paths) + len(self.parameters)
+
     def p(self, u=None, d=None):
-        """The vector p of the plant's functions: parameters, inputs u and disturbances d.
+        """The vector p of the plant's functions: place of the paths, if any, parameters, inputs u and disturbances d.
 
         Parameters
         ----------
@@ -213,9 +258,16 @@ class Plant(Value, Shown):
         u = np.zeros(m) if u is None else as_numbers(u)
         d = np.zeros(n) if d is None else array_of("d", d, n)
         if u.ndim != 2 or len(u) != m:
-            return np.concatenate([self.parameters, array_of("u", u, m), d])
-        fixed, d = (np.repeat(part[:, None], u.shape[1], axis=1) for part in (self.parameters, d))
+            return np.concatenate([self.place, self.parameters, array_of("u", u, m), d])
+        fixed = np.append(self.place, self.parameters)
+        fixed, d = (np.repeat(part[:, None], u.shape[1], axis=1) for part in (fixed, d))
         return np.concatenate([fixed, u, d])  # u is NaN where a motion ended
+
+    def p_of_cases(self, constants, u=None):
+        """The vectors p (n_p, N) of cases with other parameters (n_c, N) and the same inputs u (m,), default 0."""
+        p = np.repeat(self.p(u)[:, None], constants.shape[1], axis=1)
+        p[self.at_u - len(constants) : self.at_u] = constants
+        return p
 
     def disturbed(self, name):
         """The index in p of what a disturbance acts on.
@@ -239,7 +291,7 @@ class Plant(Value, Shown):
         """
         parameters = self.mechanism.parameters
         if name in self.disturbable:
-            return len(self.parameters) + len(self.inputs) + self.disturbable.index(name)
+            return self.at_u + len(self.inputs) + self.disturbable.index(name)
         if name not in parameters.names:
             raise self.mechanism.no("generalised force or parameter", name, (*self.disturbable, *parameters.names))
         m, place = self.mechanism, parameters.names.index(name)
@@ -257,7 +309,7 @@ class Plant(Value, Shown):
                     name=name,
                     where=what,
                 )
-        return place
+        return bool(self.paths) + place
 
     def function(self, name):
         """One of the plant's compiled functions of (t, x, p), built at first use.
@@ -338,7 +390,8 @@ class Plant(Value, Shown):
             plant = replace(self, equations=equations)
             if np.isfinite(plant.rates(t, x, rest)).all():
                 return plant
-        others.append(self.equations.near(t, x, self.parameters[: len(self.equations.values)]))
+        followed = references_at(self.paths, t)
+        others.append(self.equations.near(t, x, self.parameters[: len(self.equations.values)], followed))
         return replace(self, equations=others[-1])
 
     def state(self, values) -> np.ndarray:
@@ -392,6 +445,7 @@ class Plant(Value, Shown):
             "Plant: state ": " ".join(self.state_names),
             "  inputs ": ", ".join(self.inputs) or "(none)",
             "  material constraints: ": ", ".join(self.mechanism.constraints),
+            "  follows ": ", ".join(self.paths),
             "  changed: ": ", ".join(f"{n}={v:g}" for n, v in numbers if v != defaults[n]),
             "  limits: ": ", ".join(f"{n} {a:g} .. {b:g}" for n, (a, b) in self.limits.items()),
             "  rate limits [1/s]: ": _text(self.rate_limits),

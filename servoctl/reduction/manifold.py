@@ -363,6 +363,15 @@ def follows(q, values):
     return jets.ravel()
 
 
+def references_at(paths, t):
+    """Values of the jets of references at an instant, by names as points near a state have them."""
+    found = {}
+    for name, path in paths.items():
+        jets = path.held().jets([t], min(path.coefficients.shape[2] - 1, JETS))[:, 0, 0]
+        found |= {jet_of_reference(name, k): value for k, value in enumerate(jets.tolist())}
+    return found
+
+
 def jet_of_reference(name, k):
     """The name of a derivative of a reference among those of jets near which points are drawn."""
     return f"d{k}{name}_reference"

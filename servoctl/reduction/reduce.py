@@ -259,12 +259,12 @@ def _reduced(mechanism, program, switches, balance, context):
     )
 
 
-def references(mechanism, program):
-    """Names of the references in the expressions of a specification."""
+def references(mechanism, program, further=()):
+    """Names of the references in the expressions of a specification, and in further ones."""
     m, chosen = mechanism, (*program.weights.values(), *program.toward.values())
     of_program = (*program.with_turns.values(), *(e for e in chosen if isinstance(e, ca.SX)))
     named_rows = (*m.constraints.values(), *m.followers.values(), *m.outputs.values(), *m.reported.values())
-    return tuple(orders_in(m.q, [*of_program, *named_rows, m.balance, m.energy, m.E, m.q.V, m.q.h]))
+    return tuple(orders_in(m.q, [*of_program, *named_rows, m.balance, m.energy, m.E, m.q.V, m.q.h, *further]))
 
 
 def holds(reduction, values):

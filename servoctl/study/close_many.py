@@ -88,7 +88,8 @@ def close_many(
     gathered = None
     if not run.plant.equations.orders:  # else each loop is judged by itself
         step = run.law.step.native("step") if run.law.allocation else None
-        gathered = run_batch(derived, loop, numbers, _noise(run, seeds), traced, every, threads, step)
+        placed = run.plant.p_of_cases(numbers[0])[: run.plant.at_u]
+        gathered = run_batch(derived, loop, (placed, *numbers[1:]), _noise(run, seeds), traced, every, threads, step)
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
     meta = {
@@ -134,8 +135,7 @@ def _at_all(run, constants):
 def _resolved(run, constants, starts):
     """The loop with substeps for the case with the fastest eigenvalue."""
     plant, law, loop = run.plant, run.law, run.loop
-    rest = np.zeros((len(plant.inputs) + len(plant.disturbable), starts.shape[1]))
-    require_consistent(plant, loop.t0, starts, np.vstack([constants, rest]))
+    require_consistent(plant, loop.t0, starts, plant.p_of_cases(constants))
     if run.conditions.timing.substeps is not None:
         return loop
     substeps = _most_steps(plant, law, loop, constants, starts)
@@ -221,8 +221,7 @@ def _case_numbers(run, columns, scale):
 def _most_steps(plant, law, loop, constants, starts):
     """Integration steps per sample of the case with the fastest eigenvalue at the start."""
     n_x, n = starts.shape
-    inputs = np.repeat(loop.initial_input[:, None], n, axis=1)
-    p = np.vstack([constants, inputs, np.zeros((len(plant.disturbable), n))])
+    p = plant.p_of_cases(constants, loop.initial_input)
     both = plant.function("jacobian").grid(loop.t0, starts, p).reshape(-1, n_x, n).transpose(2, 1, 0)
     A = np.where(np.isfinite(both[:, :, :n_x]), both[:, :, :n_x], 0.0)
     case = int(np.argmax(np.abs(np.linalg.eigvals(A)).max(axis=1)))

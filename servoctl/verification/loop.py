@@ -74,7 +74,7 @@ def _again(closed, finer=1):
 def _repeated(closed):
     """Largest difference of a signal from that of the loop when it is run again, relative to the signal's size."""
     loop, law = _again(closed), closed.law
-    status, x, law_x, law_y, inputs = run_loop(closed.plant.function("ode"), law.begin(), loop)
+    status, x, law_x, law_y, inputs = run_loop(closed.plant, law.begin(), loop)
     if status != FINISHED:
         return np.inf
     m, n_y, n_z = loop.n_u, len(law.measures), len(law.state)
@@ -102,7 +102,7 @@ def _defect(closed, finer):
     """Defect |E - E0 - W| of the power balance, relative to the range of the energy, with steps shorter by a factor."""
     plant, loop = closed.plant, _again(closed, finer)
     loop = replace(loop, x0=np.append(loop.x0, 0.0))
-    status, x, *_ = run_loop(plant.function("ode_power"), closed.law.begin(), loop)
+    status, x, *_ = run_loop(plant, closed.law.begin(), loop, rates="ode_power")
     if status != FINISHED:
         return np.inf
     states, work = x[:, :-1].T, x[:, -1]
