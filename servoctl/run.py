@@ -69,7 +69,7 @@ class Sampled(ByName, Detailed):
 
     def _of_row(self, name, mechanism):
         """The residual (N,) that is read by a name of no signal of the mechanism, or `NameUnknown`."""
-        rows = rows_read(self.residual, self.names if mechanism is None else (*mechanism.signals, *self._groups))
+        rows = rows_read(self.residual, self.names if mechanism is None else (*mechanism.signals, *self.names))
         if name in rows:
             return self.residual[rows[name]][0]
         valid = (*self.names, *rows)

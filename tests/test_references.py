@@ -223,7 +223,7 @@ def test_what_is_missing_or_wrong_is_said():
     mechanism, load = crane()
     r = mechanism.q.references(X=None, Z=PATH[1])
     model = sv.derive(mechanism, sv.Program({"X": load[0] - r.X, "Z": load[1] + r.Z}, by="actuators"))
-    with pytest.raises(SpecificationError, match=r"No path was given for X.*model.with_references\(X=\.\.\.\)"):
+    with pytest.raises(SpecificationError, match=r"No path was given for X.*with_references\(X=\.\.\.\)"):
         model.start(guess=HANGING)
     with pytest.raises(NameUnknown, match="No reference is named 'Y'"):
         model.with_references(Y=PATH[0])
