@@ -11,8 +11,11 @@ from scipy.interpolate import PPoly, make_interp_spline
 
 import servoctl as sv
 from servoctl.codegen import compiler, interpreted
+from servoctl.codegen.function import compiled
+from servoctl.codegen.paths import Followed
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.model import store
+from servoctl.spec.references import function_of
 
 PATH = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(5.0, 2.0), duration=6.0, smoothness=4)
 HANGING = {"l": 4.0}
@@ -237,3 +240,19 @@ def test_what_is_missing_or_wrong_is_said():
     mass = mechanism.q.references(m_load=PATH[0]).m_load
     with pytest.raises(SpecificationError, match="A reference and a parameter are both named 'm_load'"):
         sv.derive(mechanism, sv.Program({"X": load[0] - mass, "Z": load[1] + 4}, by="actuators"))
+
+
+def test_compiled_jets_are_those_of_the_path():
+    """Of a path whose coefficients lie in memory in another order, too, and on either side of breaks."""
+    knots = sorted(np.random.default_rng(3).uniform(0.0, 6.0, 9))
+    c = np.random.default_rng(4).normal(size=(6, 8, 2))
+    path = sv.paths.polynomials(knots, c, before="hold", after="continue")
+    q = sv.coordinates("x")
+    r = q.references(a=path[0], b=path[1])
+    jets = [s for k in range(7) for s in r.d(k)]
+    f = compiled(function_of(q, r.names, "jets", q[0], ca.SX(0, 1), ca.vertcat(*jets, q[0])), "jets", ("rk",))
+    parts = [part._with(coefficients=np.asfortranarray(part.coefficients)) for part in path]
+    paths, t = Followed(parts), np.concatenate([np.linspace(-1.0, 8.0, 5001), knots])
+    values = f.grid(t, np.zeros((1, len(t))), np.array([paths.address]))[:-1].reshape(7, 2, -1)
+    exact = path.jets(t, 6)
+    assert f.backend == "c" and np.all(np.abs(values - exact) <= 1e-13 * np.abs(exact).max(axis=2, keepdims=True))
