@@ -194,6 +194,12 @@ def test_the_class_of_bare_polynomials_is_counted(jump):
     assert path.classes[path.breaks == 1.0].tolist() == [jump - 1]
 
 
+@pytest.mark.parametrize("jump, expected", [(3e-7, 0), (3e-8, np.inf)])
+def test_a_jump_counts_from_1e_7_of_a_derivative_on(jump, expected):
+    path = polynomials([0.0, 1.0, 2.0], [[1.0, 1.0 + jump], [0.0, 1.0]])
+    assert path.classes[1] == expected
+
+
 def test_a_class_that_is_stated_is_not_counted():
     times = np.linspace(0.0, 1.0, 502)
     bare = si.PPoly.from_spline(si.make_interp_spline(times, np.sin(9 * times), k=5))
@@ -329,6 +335,12 @@ def test_a_sum_merges_breaks_that_differ_by_rounding():
     a, b = rest_to_rest(0.0, 1.0, 0.3), rest_to_rest(0.0, 1.0, 0.1 + 0.2)
     total = a + b
     assert np.diff(total.breaks).min() > 1e-3 and total(0.3) == pytest.approx(2.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("apart, breaks", [(3e-13, 3), (3e-14, 2)])
+def test_breaks_are_two_from_1e_13_of_an_instant_on(apart, breaks):
+    total = rest_to_rest(0.0, 1.0, 1.0, smoothness=1) + rest_to_rest(0.0, 1.0, 1.0 + apart, smoothness=1)
+    assert len(total.breaks) == breaks
 
 
 def test_one_path_follows_another():
@@ -476,6 +488,13 @@ def test_a_function_whose_derivatives_do_not_fit_is_refused_by_the_defect(wrong)
     with refused(SpecificationError, f"derivative {wrong}", order=wrong) as caught:
         function(f, (0.0, 3.0))
     assert 1e-4 < caught.value.details["defect"] < 1e-1
+
+
+@pytest.mark.parametrize("wrong, blamed", [(4e-6, "defect"), (3e-7, "error")])
+def test_a_defect_of_1e_6_is_no_rounding(wrong, blamed):
+    with pytest.raises(SpecificationError) as caught:
+        function(lambda t: [math.sin(t), (1.0 + wrong) * math.cos(t)], (0.0, 3.0), 1)
+    assert blamed in caught.value.details
 
 
 def test_a_tolerance_below_rounding_is_refused_with_what_can_be_reached():
