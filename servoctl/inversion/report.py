@@ -11,6 +11,7 @@ from servoctl.errors import NotRealisable, SpecificationError
 from servoctl.figures.names import efforts
 from servoctl.inversion.verdict import UNREALISABLE, Verdict, endpoints, verdict
 from servoctl.markup import Detailed, fitted, listed
+from servoctl.model.following import instants_of
 from servoctl.model.model import SAMPLED, Model, derive, including
 from servoctl.model.start import State
 from servoctl.reduction.self_motion import SelfMotion, self_motion
@@ -315,7 +316,7 @@ def _directions(model, ends):
     if model.reduction.ideal or not ends:
         return None
     t, x = ends[0]
-    return directions(model.reduction, model.instants([t]), x[:, None], model.parameters)[0]
+    return directions(model.reduction, instants_of(model, [t]), x[:, None], model.parameters)[0]
 
 
 def _ranks(model, structure, run, ends):
@@ -345,7 +346,7 @@ def _margins(run, some, part):
     inside = some[(some >= first) & (some < end)]
     if not len(inside):
         return []
-    instants = variant.instants(run.t[inside])
+    instants = instants_of(variant, run.t[inside])
     return margins(variant.reduction, instants, run.jets[:, inside], variant.parameters)
 
 

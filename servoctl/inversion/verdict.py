@@ -13,6 +13,7 @@ from servoctl.growth import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.methods.choice import Bounded
 from servoctl.methods.kinks import SMOOTHER, kink, stays_on_switch
+from servoctl.model.following import instants_of
 from servoctl.model.model import Model, default_start
 from servoctl.model.start import State
 from servoctl.model.variants import strong_near
@@ -186,7 +187,7 @@ def _derived_for(model, motion, t, x):
 
 def _lost_rank(model, t, x):
     """What is lost where the equations have not the rank that they have in motion; "" if nothing is."""
-    if margins(model.reduction, model.instants([t]), x[:, None], model.parameters)[0] != 0:
+    if margins(model.reduction, instants_of(model, [t]), x[:, None], model.parameters)[0] != 0:
         return ""
     there, usual = model.structure([t], x[:, None]), model.structure()
     if not (there.zeros_at_infinity and usual.zeros_at_infinity):

@@ -1,6 +1,7 @@
 """A motion ends where a row takes another order than the one that it was derived with."""
 
 from servoctl.errors import ServoError
+from servoctl.model.following import instants_of
 from servoctl.model.variants import derived_near
 from servoctl.reduction.orders import other_order
 
@@ -8,7 +9,7 @@ from servoctl.reduction.orders import other_order
 def end_where_orders_change(motion):
     """Cut a motion in place before the first sample at which a row has another order, and set the error as its stop."""
     for model, t, jets in motion.by_piece():
-        k, name = model.reduction.orders.first_change(model.instants(t), jets, model.parameters)
+        k, name = model.reduction.orders.first_change(instants_of(model, t), jets, model.parameters)
         if k is not None:
             motion.end_before(t[k], _other_order(model, name, float(t[k]), jets[:, k]))
             return

@@ -1,8 +1,12 @@
 """The paths that a model follows: what its motion needs of them, and the instants at which its steps end."""
 
+from math import factorial
+
 import numpy as np
 
 from servoctl.errors import SpecificationError
+from servoctl.jets.tape import JETS, REAL
+from servoctl.model.points import with_place
 
 SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
 
@@ -51,3 +55,19 @@ def require_class(name, path, needs, span, jumps):
             needs=needs,
             t=float(inside[0]),
         )
+
+
+def p_with(model, parameters):
+    """The parameters of a model's compiled functions, with others (n_p,) or (n_p, N) than its own."""
+    return with_place((model._followed.address,) if model.paths else (), parameters)
+
+
+def instants_of(model, t):
+    """Instants (N, 1 + R) of times (N,) [s]: with the jets of the paths that a model follows there."""
+    family = model.reduction.mechanism.q.family
+    result = np.zeros((len(t), len(family), JETS + 1), dtype=REAL)
+    for name, path in zip(model.paths, model._followed.paths, strict=True) if model.paths else ():
+        order = min(JETS, path.coefficients.shape[2] - 1)
+        sizes = np.array([[factorial(k)] for k in range(order + 1)], dtype=float)
+        result[:, family.names.index(name), : order + 1] = (path.jets(t, order)[:, 0] / sizes).T
+    return np.column_stack([np.asarray(t, dtype=REAL), result.reshape(len(t), -1)])

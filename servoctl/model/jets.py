@@ -7,6 +7,7 @@ import numpy as np
 
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import REAL
+from servoctl.model.following import instants_of
 from servoctl.reduction.manifold import ON_MANIFOLD, solve
 
 
@@ -42,7 +43,7 @@ def extended(model, t, jets, size):
     scale = np.repeat([1.0, *(factorial(k) for k in range(1, level + 1))], [q.nq, *level * [q.n]])[:, None]
     z = np.zeros((size, len(t)), dtype=REAL)
     z[: len(jets)] = jets / scale[: len(jets)]
-    instants = model.instants(t)
+    instants = instants_of(model, t)
     points = replace(r.points, instants=instants, z=z, values=model.parameters, residual=np.zeros(len(t)))
     if r.cascade is not None:
         deeper, good = r.cascade.continued(points, level, r.top - 1)

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
-from math import factorial
 
 import casadi as ca
 import numpy as np
@@ -13,12 +12,10 @@ from servoctl.checks import MOST_JETS, as_numbers, by_name, finite, named, whole
 from servoctl.codegen.function import compiled
 from servoctl.codegen.paths import Followed
 from servoctl.errors import ServoError, SpecificationError
-from servoctl.jets.tape import JETS, REAL
 from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
-from servoctl.model.following import SMOOTHER, breaks_within
+from servoctl.model.following import SMOOTHER, breaks_within, instants_of, p_with
 from servoctl.model.jets import jet_names_to
-from servoctl.model.points import with_place
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
@@ -29,7 +26,6 @@ from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.knots import require_smooth
-from servoctl.reduction.manifold import references_at
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
@@ -248,25 +244,7 @@ class Model(Detailed):
     @cached_property
     def p(self):
         """The parameters of compiled functions: those of the model, after the place of the paths that it follows."""
-        return read_only(self.p_with(self.parameters)) if self.paths else self.parameters
-
-    def p_with(self, parameters):
-        """The same with other parameters (n_p,) or (n_p, N)."""
-        return with_place((self._followed.address,) if self.paths else (), parameters)
-
-    def instants(self, t):
-        """Instants (N, 1 + R) of times (N,) [s]: with the jets of the paths that are followed there."""
-        family = self.reduction.mechanism.q.family
-        result = np.zeros((len(t), len(family), JETS + 1), dtype=REAL)
-        for name, path in zip(self.paths, self._followed.paths, strict=True) if self.paths else ():
-            order = min(JETS, path.coefficients.shape[2] - 1)
-            sizes = np.array([[factorial(k)] for k in range(order + 1)], dtype=float)
-            result[:, family.names.index(name), : order + 1] = (path.jets(t, order)[:, 0] / sizes).T
-        return np.column_stack([np.asarray(t, dtype=REAL), result.reshape(len(t), -1)])
-
-    def references_at(self, t):
-        """Derivatives of the references at an instant, by names as points near a state have them."""
-        return references_at(required_paths(self.paths), t)
+        return read_only(p_with(self, self.parameters)) if self.paths else self.parameters
 
     def _holds(self, values):
         """Whether every decision of the derivation is the same with other parameters."""
@@ -445,13 +423,13 @@ class Model(Detailed):
             return self.once("structure", lambda: structure(self.reduction, start=self._default_start()))
         model = including(self, names_of(motion))
         t, jets = _samples(model, motion, jets)
-        return structure(model.reduction, model.instants(t), jets, model.parameters)
+        return structure(model.reduction, instants_of(model, t), jets, model.parameters)
 
     def _default_start(self):
         """The instant and the values of the start without held or guessed values; None if there is none."""
         with suppress(ServoError):
             start = default_start(self)
-            return self.instants([start.t]), start.values
+            return instants_of(self, [start.t]), start.values
 
     def _lines(self, full):
         return describe(self, full)

@@ -14,6 +14,7 @@ from servoctl.codegen.paths import evaluated
 from servoctl.errors import InconsistentStart, ServoError, SingularProgram
 from servoctl.jets.branches import shown
 from servoctl.model.equations import gradient_jets, invariant_names
+from servoctl.model.following import instants_of
 from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
 from servoctl.model.variants import derived_near
 from servoctl.progress import stage
@@ -145,7 +146,7 @@ def _divisors(model, variant, t, x):
     if not divisors:
         return [], np.zeros(0)
     jets = np.append(x[: len(model.state_names)], np.zeros(model.n))[:, None]
-    there = usual.at(model.instants([t]), jets, model.parameters)
+    there = usual.at(instants_of(model, [t]), jets, model.parameters)
     sizes = (np.abs(points.evaluate([pivot for _, pivot in divisors])[0]).max(axis=1) for points in (there, usual))
     with np.errstate(all="ignore"):
         return divisors, np.divide(*sizes)

@@ -12,6 +12,7 @@ from servoctl.codegen.paths import evaluated
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError
 from servoctl.markup import Shown
 from servoctl.model.equations import Invariants, invariant_names
+from servoctl.model.following import instants_of
 from servoctl.model.jets import jet_names_to
 from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
 from servoctl.model.variants import derived_near, reordered_at, strong_near
@@ -361,7 +362,7 @@ def _by_blocks(model, t, equations, aim):
     r, q, n_x = model.reduction, model.reduction.mechanism.q, len(model.state_names)
     sizes = np.repeat([1.0, *(factorial(k) for k in range(1, r.top))], [q.nq, *[q.n] * (r.top - 1)])
     z = (aim.reference[:n_x] / sizes)[:, None]
-    z, _ = r.cascade.continued(replace(r.points, instants=model.instants([t]), z=z, values=model.parameters), r.top)
+    z, _ = r.cascade.continued(replace(r.points, instants=instants_of(model, [t]), z=z, values=model.parameters), r.top)
     x = aim.reference.copy()
     x[:n_x] = np.where(aim.movable[:n_x], z[:n_x, 0].astype(float) * sizes, x[:n_x])
     x = gauss_newton(equations, np.where(np.isfinite(x), x, aim.reference), aim)

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.model.equations import invariant_names
+from servoctl.model.following import p_with
 from servoctl.reduction.manifold import WELL_CONDITIONED
 
 PASSES = 2  # Newton steps of each level: one solves it, another one takes what rounding left
@@ -65,7 +66,7 @@ def linear_starts(model, t, held, p):
     solved[:] = True
     with np.errstate(all="ignore"):
         for rows, unknown in (level for level in levels for _ in range(PASSES)):
-            y = f.grid(t, states.T, model.p_with(p.T))
+            y = f.grid(t, states.T, p_with(model, p.T))
             jacobian = y[m:].reshape(states.shape[1], m, -1)[np.ix_(unknown, rows)].transpose(2, 1, 0)
             sizes = np.linalg.norm(jacobian, axis=2)
             scaled, off = jacobian / sizes[:, :, None], y[rows].T / sizes

@@ -4,8 +4,11 @@ import numpy as np
 
 from servoctl.errors import ServoError, SingularProgram, SpecificationError
 from servoctl.model import saddle
+from servoctl.model.following import instants_of
 from servoctl.model.pivots import pivot_strength
 from servoctl.reduction.definite import Definite, definite
+from servoctl.reduction.manifold import references_at
+from servoctl.spec.references import required_paths
 from servoctl.tolerances import ENTRY, RESOLVED
 
 DIAGONAL = "diagonal"  # pivots of definite matrices, beside places of other pivots
@@ -24,7 +27,7 @@ def derived_near(model, t, jets, sizes=()):
     default = model.once("jet sizes", lambda: model.equations.jet_sizes)
     model._store.require_unchanged()
     sizes = {name: size for name, size in dict(sizes).items() if size > ENTRY * default.get(name, 0.0)}
-    state = dict(zip(model.jet_names, jets.tolist(), strict=True)) | model.references_at(t)
+    state = dict(zip(model.jet_names, jets.tolist(), strict=True)) | references_at(required_paths(model.paths), t)
     place = (float(t), state, default | sizes)
     key = repr(place)
     if key in model._variants:
@@ -91,7 +94,7 @@ def reordered_at(model, t, jets):
     if model.equations.definite or model.equations.sparse or (r.cascade is None and model.flat and model.nq != model.n):
         return None
     try:
-        order = r.order_at(model.instants([t]), np.asarray(jets, dtype=float), model.parameters)
+        order = r.order_at(instants_of(model, [t]), np.asarray(jets, dtype=float), model.parameters)
     except SingularProgram:
         return None
     return None if order == r.order else _formed(model, order)

@@ -14,6 +14,7 @@ from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
+from servoctl.model.following import p_with
 from servoctl.model.model import Model, including, knots_within
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
@@ -223,7 +224,7 @@ class _Many:
     def plans(self, span, times, threads, progress):
         """Compute the plans whose pivots do not fall."""
         which, x0, p = self._prepared(span)
-        cases = x0, self.model.p_with(p.T).T
+        cases = x0, p_with(self.model, p.T).T
         ends, samples, self.interrupted = plan_many(self.model, span, cases, times, threads, progress)
         if ends is not None:
             good = ends[:, 0] > 0

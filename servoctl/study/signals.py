@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from servoctl.model.equations import signal_groups
+from servoctl.model.following import p_with
 from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.run import ByName, Run
 
@@ -60,7 +61,7 @@ class Signals(ByName, Mapping):
     def _evaluated(self, f, part):
         """A function of the jets, or the highest of these, (n, K, N) for some motions."""
         model, count = self._model, len(part)
-        t, p = np.repeat(self._t, count), np.tile(model.p_with(self._parameters[:, part]), len(self._t))
+        t, p = np.repeat(self._t, count), np.tile(p_with(model, self._parameters[:, part]), len(self._t))
         jets = with_highest(model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
         y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
         return y.reshape(len(y), len(self._t), count)
