@@ -236,7 +236,7 @@ CURVES = {  # points of the parameter u, and their heading
 }
 
 
-@pytest.mark.parametrize(("kind", "speed"), [("wave", "squared"), ("parabola", "forward"), ("circle", "forward")])
+@pytest.mark.parametrize(("kind", "speed"), [("wave", "forward"), ("parabola", "squared"), ("circle", "forward")])
 def test_a_geometric_path_beside_rolling_is_followed(kind, speed):
     """Rolling beside a path by its geometry leaves the speed times an angle; the angle is the hidden row."""
     q = sv.coordinates("x y psi u")

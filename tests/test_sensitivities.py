@@ -69,7 +69,7 @@ def test_extrema_of_the_crane(crane):
             assert s.extrema(of)["m_load"][side] == pytest.approx(difference, abs=1e-8)
 
 
-SCENES = ("passive-arm", "appell-hamel", "mass-on-car-absolute", "wheeled-robot", "winch-crane")
+SCENES = ("appell-hamel", "mass-on-car-absolute", "winch-crane")
 
 
 @pytest.mark.parametrize("name", SCENES)
