@@ -366,7 +366,7 @@ class Search:
         p = self.parameters(v)
         model, (first, last, end_slopes) = self.motions.with_parameters(p), self.motions.window(p)
         nodes = first + self.parts * (last - first)
-        t, weights = quadrature([first, *(k for k in model.knots if first < k < last), last], SQUARE_PANELS)
+        t, weights = quadrature([first, *(k for k in model.corners if first < k < last), last], SQUARE_PANELS)
         times, where = np.unique(np.concatenate([nodes, t]), return_inverse=True)
         run = self.motions.run(model, times)
         tangents = sensitivity(run, self.signals, self.motions.names)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from math import factorial
 
 import casadi as ca
@@ -323,6 +324,12 @@ class Model(Detailed):
     def knots(self):
         """Instants [s] at which paths switch between smooth pieces."""
         return self._knots.times
+
+    @property
+    def corners(self):
+        """The same with the breaks of the paths that references follow, ascending."""
+        breaks = (path.breaks[np.isfinite(path.classes)].tolist() for path in required_paths(self.paths).values())
+        return tuple(sorted({*self.knots, *chain.from_iterable(breaks)}))
 
     @cached_property
     def equations(self):

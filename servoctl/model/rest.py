@@ -172,7 +172,7 @@ def _first_start(model, t, chosen):
 
 def _later(model, t):
     """Instants [s] after t, farther and farther, up to a quarter of the time to the next knot."""
-    length = min((knot - t for knot in model.knots if knot > t), default=1.0)
+    length = min((knot - t for knot in model.corners if knot > t), default=1.0)
     return [t + tau * length for tau in LATER]
 
 

@@ -1,8 +1,10 @@
 """References: signals that a program follows, as symbols r, r', r'', ... whose values come from paths."""
 
 import threading
+from math import factorial
 
 import casadi as ca
+import numpy as np
 
 from servoctl.checks import named, whole_of
 from servoctl.errors import SpecificationError
@@ -130,6 +132,38 @@ def called(q, names, f, x, p):
     return f(q.t, x, ca.vertcat(ca.SX(0 if names else ca.SX(0, 1)), p), *jets)
 
 
+class Jets:
+    """The jets of references in expressions as further numbers of a column, whose values follow from paths by name.
+
+    `places` are their names and orders, `symbols` and `rates`, the next jets, SX columns.
+    """
+
+    def __init__(self, q, expressions, paths=None):
+        symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *map(ca.vec, expressions)))
+        found = [(place, s) for s in symbols if (place := q.where(s)) and place[0] == "r"]
+        self.symbols = ca.vertcat(ca.SX(0, 1), *(s for _, s in found))
+        self._names, self.places = q.family.names, [(q.family.names[i], k) for (_, k, i), _ in found]
+        self.rates = ca.vertcat(ca.SX(0, 1), *(q.family.jet(name, k + 1) for name, k in self.places))
+        self._paths = paths and required_paths({name: paths[name] for name, _ in self.places})
+
+    def __len__(self):
+        return len(self.places)
+
+    def __getstate__(self):
+        return {name: value for name, value in vars(self).items() if not isinstance(value, ca.SX)}
+
+    def of(self, instants):
+        """Their values (n, N) at instants (N, 1 + R) of points."""
+        columns = [1 + self._names.index(name) * (JETS + 1) + k for name, k in self.places]
+        sizes = np.array([[factorial(k)] for _, k in self.places], dtype=float).reshape(-1, 1)
+        return np.asarray(instants[:, columns], dtype=float).T * sizes
+
+    def at(self, t):
+        """Their values at times (N,) [s], (n, N); a path that says nothing of an instant is held there."""
+        rows = [self._paths[name].held().jets(t, k)[k] for name, k in self.places]
+        return np.concatenate([np.zeros((0, len(t))), *rows])
+
+
 def required_paths(paths):
     """The paths by name; refused where there is none yet."""
     if missing := [name for name, path in paths.items() if path is None]:
@@ -155,3 +189,13 @@ def followed_path(name, path):
             components=path.dim,
         )
     return path
+
+
+def rates_in_time(q, expressions):
+    """The partial derivatives (n,) of SX expressions (n,) by the time, along the paths of their references."""
+    rates = ca.jacobian(expressions, q.t)
+    for symbol in ca.symvar(expressions):
+        place = q.where(symbol)
+        if place and place[0] == "r":
+            rates += ca.jacobian(expressions, symbol) * q.family.jet(q.family.names[place[2]], place[1] + 1)
+    return rates
