@@ -313,8 +313,8 @@ class Transfer:
         u_size = np.abs(u).max(axis=1)
         u_size = np.where(u_size > 1e-6 * u_size.max(), u_size, u_size.max() or 1.0)
         v = np.concatenate([u_size, np.zeros(self.m * self.node.depth)])
-        sizes = x_size, u_size, self._bounded_sizes(times, x, u), float(effort(self.node.at(self.span[:1]), self.begin, v)) or 1.0
-        return x, u, sizes
+        at_start = float(effort(self.node.at(self.span[:1]), self.begin, v)) or 1.0
+        return x, u, (x_size, u_size, self._bounded_sizes(times, x, u), at_start)
 
     def _bounded_sizes(self, times, x, u):
         """Size of each bounded quantity (b,): its largest value along states and inputs, at least that of its sides."""

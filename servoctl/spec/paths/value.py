@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from servoctl.checks import MOST_JETS, array_of, as_numbers, is_number, positive, whole, whole_of
+from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, is_number, positive, whole, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.values import Value, frozen, read_only
 
@@ -249,20 +249,22 @@ class Path(Value):
         classes = np.concatenate([self.classes[:-1], [joined], other.classes[1:]])
         return Path(breaks, coefficients, classes, self.before, other.after)
 
-    def at_rate(self, factor):
-        """The path along a clock that runs faster, from the same first instant on.
+    def at_rate(self, factor, about=None):
+        """The path along a clock that runs faster.
 
         Parameters
         ----------
         factor : float
             Positive; 2 halves the time that it takes.
+        about : float, optional
+            The instant at which both clocks agree [s]; default: the first one of the path.
 
         Returns
         -------
         Path
         """
-        first = self.breaks[0]
-        return self._with(breaks=first + (self.breaks - first) / positive("factor", factor))
+        fixed = self.breaks[0] if about is None else finite("about", about, "instant")
+        return self._with(breaks=fixed + (self.breaks - fixed) / positive("factor", factor))
 
     def plot(self, order=2):
         """Draw the path and its derivatives over its span.
