@@ -104,8 +104,11 @@ def _model(model, name):
     names = [name for group, _ in groups for name in group]
     ode, symbols = model.function("ode"), model.reduction.mechanism.parameters.names
 
+    def numbers(params):
+        return model.p_with(_parameter_values(p, symbols, params))
+
     def rates(t, x, _, params):
-        y = ode(t, x, _parameter_values(p, symbols, params))[:n_x]
+        y = ode(t, x, numbers(params))[:n_x]
         if not np.isfinite(y).all():
             raise ServoError(
                 f"The reduced dynamics is not finite at t = {t:.6g} s.",
@@ -116,8 +119,8 @@ def _model(model, name):
         return y
 
     def outputs(t, x, u, params):
-        z, numbers = np.append(x, rates(t, x, u, params)[-n:]), _parameter_values(p, symbols, params)
-        return np.concatenate([x, *(f(t, z, numbers) for group, f in groups if group)])
+        z = np.append(x, rates(t, x, u, params)[-n:])
+        return np.concatenate([x, *(f(t, z, numbers(params)) for group, f in groups if group)])
 
     return control.nlsys(
         rates,
