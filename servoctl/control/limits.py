@@ -534,7 +534,7 @@ def limit_report(run: Closed, scene: Mapping[str, Any] | None = None) -> LimitRe
         model = run.plan.model
         mechanism, program = model.reduction.mechanism, model.reduction.program
         paths = {name: model.paths[name] for name in program.references(mechanism.q)}
-        slower = fastest(mechanism, program, allocation.plant.limits, **scene, references=paths).factor
+        slower = fastest(mechanism, program, allocation.plant.limits, **scene, paths=paths).factor
     return LimitReport(_slacks(run, allocation), {name: s for name, s in met.items() if s}, overload, slower)
 
 

@@ -83,7 +83,7 @@ def fastest(
     guess: Mapping[str, float] | None = None,
     parameters: Mapping[str, float] | None = None,
     shape: bool = False,
-    references: Mapping[str, Any] | None = None,
+    paths: Mapping[str, Any] | None = None,
 ) -> TimeLaw:
     """The fastest time law along the path of a program under which signals keep their limits.
 
@@ -111,8 +111,8 @@ def fastest(
         Parameters of the mechanism that differ from their defaults.
     shape : bool, optional
         Whether the law along the path is free; default: only its duration is.
-    references : dict of str to Path, optional
-        Paths of the program's references by name; default: those with which they were made.
+    paths : dict of str to Path, optional
+        Those of the program's references by name; default: those with which they were made.
 
     Returns
     -------
@@ -147,7 +147,7 @@ def fastest(
         {name: finite(name, value, "start value") for name, value in mapping(start, "The start values").items()},
         guess,
         mapping(parameters, "The parameters"),
-        paths_of(mechanism.q, program, references),
+        paths_of(mechanism.q, program, paths),
     )
     with progress_bar("fastest", None, unit=" motions") as bar:
         return _optimal(scene, bar) if require_kind(bool, "shape", shape, "shape=True") else _even(scene, bar)
@@ -223,10 +223,10 @@ def _optimal(scene, bar):
     )
 
 
-def paths_of(q, program, references):
+def paths_of(q, program, given):
     """The paths of a program's references by name, some of which may be given."""
     paths = {name: q.family.paths[name] for name in program.references(q)}
-    changes = by_name(mapping(references, "The references"), paths, "reference", "The references")
+    changes = by_name(mapping(given, "The paths"), paths, "reference", "The references")
     return required_paths(paths | {name: followed_path(name, path) for name, path in changes.items()})
 
 
