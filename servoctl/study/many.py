@@ -163,7 +163,7 @@ class _Many:
 
     def __init__(self, model, n, columns, paths, starts, n_times):
         self.model, self.n, self.columns, self.starts, self.models = model, n, columns, starts, {}
-        self.paths, self.followers = paths, None
+        self.paths, self.followers, self.knots = paths, None, []
         self.interrupted, n_x = False, len(model.state_names)
         self.done, self.steps, self.errors, self.runs = np.zeros(n, bool), np.full(n, np.nan), {}, {}
         self.parameters = np.tile(model.parameters, (n, 1))
@@ -262,9 +262,9 @@ class _Many:
     def plans(self, span, times, threads, progress):
         """Compute the plans whose pivots do not fall."""
         which, x0, p = self._prepared(span)
-        groups, of = {}, self._knots(which, span)
-        for k, knots in enumerate(of):
-            groups.setdefault(knots, []).append(k)
+        groups = {} if self.paths else {knots_within(self.model, (min(span), max(span))): range(len(which))}
+        for k, i in enumerate(which.tolist() if self.paths else ()):
+            groups.setdefault(self.knots[i], []).append(k)
         for knots, some in groups.items():
             cases = x0[some], self.numbers(which[some], p[some])
             ends, samples, self.interrupted = plan_many(self.model, span, cases, times, knots, threads, progress)
@@ -273,12 +273,6 @@ class _Many:
                 self._take(which[some][good], ends[good], samples[good])
             if self.interrupted:
                 return
-
-    def _knots(self, which, span):
-        """The knots within a span of each of some cases, tuples of instants."""
-        models = self.along(which) if self.paths else [self.model]
-        found = [knots_within(model, (min(span), max(span))) for model in models]
-        return found if self.paths else found * len(which)
 
     def _take(self, which, ends, samples):
         """Take what was computed for some cases."""
@@ -300,19 +294,20 @@ class _Many:
                 if model.reduction is self.model.reduction and (self.paths or knots_within(model, span) == knots):
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
-        ready &= [self._fits(i, span) for i in range(self.n)]
+        ready &= self._smooth(span) if self.paths else True
         which = np.flatnonzero(ready)
         return which, x[which], p[which]
 
-    def _fits(self, i, span):
-        """Whether the paths of a case are smooth enough within a span; those that are not become its error."""
-        if not self.paths:
-            return True
-        try:
-            knots_within(self.along([i])[0], span)
-        except ServoError:
-            return False
-        return True
+    def _smooth(self, span):
+        """Cases (N,) whose paths are smooth enough within a span, whose knots are kept; other cases become errors."""
+        models, smooth = self.along(range(self.n)), np.ones(self.n, bool)
+        self.knots = [()] * self.n
+        for i, model in enumerate(models):
+            try:
+                self.knots[i] = knots_within(model, span)
+            except ServoError:
+                smooth[i] = False
+        return smooth
 
     def _started(self, t, x, p):
         """Cases (N,) whose states x (N, n_x) follow for all cases at once; these are set."""

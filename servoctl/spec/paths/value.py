@@ -157,7 +157,12 @@ class Path(Value):
 
     def held(self):
         """The path that is held outside where nothing was said of it."""
-        return self._with(before=self.before or "hold", after=self.after or "hold")
+        if self.before and self.after:
+            return self
+        found = object.__new__(Path)  # whose other fields need no check
+        rules = {"before": self.before or "hold", "after": self.after or "hold", "remark": ""}
+        found.__dict__.update(self.__dict__ | rules)
+        return found
 
     def breaks_below(self, smooth, low, high):
         """Instants (N,) from `low` to `high` at which fewer than `smooth` derivatives are continuous."""
