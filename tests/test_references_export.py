@@ -28,7 +28,9 @@ def cart():
 def jets_of(model, plan, t):
     """What a controller passes: the references at t in the order of the enum of the header."""
     order = len(plan.indices("ref")) // len(model.paths)
-    return np.concatenate([path.held().jets([t], 15)[:order, 0, 0][:, None] for path in model.paths.values()], 1).ravel()
+    return np.concatenate(
+        [path.held().jets([t], 15)[:order, 0, 0][:, None] for path in model.paths.values()], 1
+    ).ravel()
 
 
 @pytest.mark.parametrize("form", ["table", "argument"])

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import referred
+from refusals import refused
 
 import servoctl as sv
+from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.study import many
 
 
@@ -53,3 +55,53 @@ def test_starts_by_name_and_other_workers(model):
     assert np.array_equal(here["final theta"], there["final theta"]) and np.array_equal(
         plan["final x"], planned["final x"]
     )
+
+
+def detours(count):
+    """Paths of the load from one place to others, some of them with a pause on the way, or of another class."""
+    ends = np.linspace(3.0, 6.0, count)
+    paths = [sv.paths.rest_to_rest(0.0, end, 6.0, smoothness=4 + i % 3) for i, end in enumerate(ends)]
+    paths[1] = sv.paths.rest_to_rest(0.0, 2.0, 3.0).then(sv.paths.rest_to_rest(2.0, 5.0, 2.5))
+    return paths
+
+
+def test_a_path_for_each_case_is_that_of_simulate_at_once(model, monkeypatch):
+    paths, times = detours(9), np.linspace(0.0, 6.0, 13)
+    start, masses = model.start(guess={"l": 4.0}), np.linspace(90.0, 110.0, 9)
+    with monkeypatch.context() as patch:
+        patch.setattr(many._Many, "_one", lambda *_: pytest.fail("one by one"))
+        found = sv.simulate_many(model, start, {"m_l": masses}, (0.0, 6.0), paths={"X": paths}, t_eval=times)
+        again = sv.simulate_many(model, start, None, (6.0, 0.0)[::-1], paths={"X": paths})
+    for i in (0, 1, 5, 8):
+        along = model.with_references(X=paths[i])
+        run = sv.simulate(along.with_parameters(m_l=masses[i]), start, (0.0, 6.0), t_eval=times)
+        for name in ("x", "theta", "d2theta", "trolley", "hoist"):
+            assert np.abs(found.trace[name][:, i] - run[name]).max() <= 1e-11 * np.abs(run[name]).max()
+        assert again["final x"][i] == pytest.approx(paths[i](6.0), abs=1e-11)
+
+
+def test_paths_of_integrated_motions_of_workers_and_in_pickles():
+    import pickle
+    from concurrent.futures import ProcessPoolExecutor
+
+    cart, paths = referred.cart(), [sv.paths.rest_to_rest(0.0, end, 0.4) for end in (0.5, 1.0)]
+    arguments = cart, {"theta": [0.1, 0.2], "dtheta": [0.0, 0.0]}, None, (0.0, 0.4), "RK4"
+    here = sv.simulate_many(*arguments, paths={"r": paths}, t_eval=[0.2, 0.4])
+    with ProcessPoolExecutor(1) as pool:
+        there = sv.simulate_many(*arguments, paths={"r": paths}, t_eval=[0.2, 0.4], executor=pool)
+    kept = pickle.loads(pickle.dumps(here))
+    for i, path in enumerate(paths):
+        along = cart.with_references(r=path)
+        run = sv.simulate(along, along.start(theta=[0.1, 0.2][i], dtheta=0.0), (0.0, 0.4), "RK4", t_eval=[0.2, 0.4])
+        for batch in (here, there, kept):
+            assert np.abs(batch.trace["force"][:, i] - run["force"]).max() < 1e-11 * np.abs(run["force"]).max()
+
+
+def test_what_paths_cannot_be(model):
+    start, paths = model.start(guess={"l": 4.0}), detours(3)
+    with refused(NameUnknown, "'Y'"):
+        sv.simulate_many(model, start, None, (0.0, 6.0), paths={"Y": paths})
+    with refused(SpecificationError, "a path for each case", "with_references"):
+        sv.simulate_many(model, start, None, (0.0, 6.0), paths={"X": paths[0]})
+    with refused(SpecificationError, "2, 3"):
+        sv.simulate_many(model, start, {"m_l": [90.0, 100.0]}, (0.0, 6.0), paths={"X": paths})

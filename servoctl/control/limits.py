@@ -547,8 +547,10 @@ def limit_report(run: Closed, scene: Mapping[str, Any] | None = None) -> LimitRe
     met = {name: float(np.mean(run.signal[f"{kind} {name}"] != 0)) for kind, name in allocation.limits}
     overload, slower = _overload(run.plan, allocation.plant), None
     if scene is not None and overload is not None:
-        reduction = run.plan.model.reduction
-        slower = fastest(reduction.mechanism, reduction.program, allocation.plant.limits, **scene).factor
+        model = run.plan.model
+        mechanism, program = model.reduction.mechanism, model.reduction.program
+        paths = {name: model.paths[name] for name in program.references(mechanism.q)}
+        slower = fastest(mechanism, program, allocation.plant.limits, **scene, paths=paths).factor
     return LimitReport(_slacks(run, allocation), {name: s for name, s in met.items() if s}, overload, slower)
 
 

@@ -2,13 +2,14 @@
 
 import functools
 from collections.abc import Mapping
+from dataclasses import field
 from typing import Any
 
 import numpy as np
 
-from servoctl.checks import as_span, finite, interval, mapping, require_kind
+from servoctl.checks import as_span, by_name, finite, interval, mapping, require_kind
 from servoctl.control.extremes import excesses, extremes
-from servoctl.control.time_optimal import Curve, Inverse, Problem, smooth
+from servoctl.control.time_optimal import Curve, Inverse, Problem, in_formulas, smooth
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -26,6 +27,7 @@ from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.paths import rest_to_rest
 from servoctl.spec.program import Program
+from servoctl.spec.references import followed_path, names_in, required_paths
 from servoctl.values import frozen
 
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
@@ -51,6 +53,8 @@ class TimeLaw:
         The program with this time law.
     plan : Run
         Its motion, within all limits.
+    paths : dict of str to Path
+        Those of the program's references with this time law, as for `Model.with_references`.
     binding : (str, str, float)
         The signal that reaches its limit, the side ("lower" or "upper"), and the instant [s].
     """
@@ -59,6 +63,7 @@ class TimeLaw:
     program: Program
     plan: Run
     binding: tuple[str, str, float]
+    paths: dict = field(default_factory=dict)
 
     def __repr__(self):
         name, side, t = self.binding
@@ -78,6 +83,7 @@ def fastest(
     guess: Mapping[str, float] | None = None,
     parameters: Mapping[str, float] | None = None,
     shape: bool = False,
+    paths: Mapping[str, Any] | None = None,
 ) -> TimeLaw:
     """The fastest time law along the path of a program under which signals keep their limits.
 
@@ -105,6 +111,8 @@ def fastest(
         Parameters of the mechanism that differ from their defaults.
     shape : bool, optional
         Whether the law along the path is free; default: only its duration is.
+    paths : dict of str to Path, optional
+        Those of the program's references by name; default: those with which they were made.
 
     Returns
     -------
@@ -122,7 +130,7 @@ def fastest(
     IntegrationStopped
         If the optimisation with `shape=True` finds no minimum.
     NameUnknown
-        For a limit of an unknown signal.
+        For a limit of an unknown signal, or the path of an unknown reference.
     """
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     require_kind(Program, "program", program, "sv.Program({...})")
@@ -139,6 +147,7 @@ def fastest(
         {name: finite(name, value, "start value") for name, value in mapping(start, "The start values").items()},
         guess,
         mapping(parameters, "The parameters"),
+        paths_of(mechanism.q, program, paths),
     )
     with progress_bar("fastest", None, unit=" motions") as bar:
         return _optimal(scene, bar) if require_kind(bool, "shape", shape, "shape=True") else _even(scene, bar)
@@ -151,8 +160,8 @@ def _even(scene, bar):
     @functools.cache
     def attempt(factor):
         try:
-            slower = scene.program.slowed(scene.mechanism.q, factor, at=scene.t_span[0])
-            return scene.tried(slower, factor)
+            slower = scene.program.slower(scene.mechanism.q, factor, scene.t_span[0])
+            return scene.tried(slower, factor, scene.slower_paths(factor))
         finally:
             bar.update()
 
@@ -168,12 +177,13 @@ def _even(scene, bar):
             factor=factor,
             slow=slow,
         )
-    return TimeLaw(factor, slower, plan if plan.model.flat else judged(plan), binding)
+    return TimeLaw(factor, slower, plan if plan.model.flat else judged(plan), binding, scene.slower_paths(factor))
 
 
 def _optimal(scene, bar):
     """The time law that is free along the curve: solved within the limits at nodes, and these tightened in between."""
-    curve = Curve(scene.mechanism, scene.program, scene.t_span, scene.parameters)
+    program = in_formulas(scene.mechanism.q, scene.program, scene.paths)
+    curve = Curve(scene.mechanism, program, scene.t_span, scene.parameters)
     inverse = Inverse(curve, tuple(scene.limits), scene.parameters, scene.guess)
     (t0, t1), t = scene.t_span, scene.mechanism.q.t
 
@@ -213,9 +223,16 @@ def _optimal(scene, bar):
     )
 
 
+def paths_of(q, program, given):
+    """The paths of a program's references by name, some of which may be given."""
+    paths = {name: q.family.paths[name] for name in program.references(q)}
+    changes = by_name(mapping(given, "The paths"), paths, "reference", "The references")
+    return required_paths(paths | {name: followed_path(name, path) for name, path in changes.items()})
+
+
 @frozen
 class _Scene:
-    """A program, its span and start, and the limits of its signals."""
+    """A program, its span and start, the limits of its signals, and the paths of its references."""
 
     mechanism: Mechanism
     program: Program
@@ -224,12 +241,27 @@ class _Scene:
     start: dict
     guess: dict
     parameters: dict
+    paths: dict
 
-    def tried(self, slower, factor):
+    def slower_paths(self, factor):
+        """The paths of the program's references along a time that is slowed by a factor, by name."""
+        m = self.mechanism
+        both = [name for name in names_in(m.q, [m.balance, m.E, *m.constraints.values()]) if name in self.paths]
+        if both:
+            raise SpecificationError(
+                f"The mechanism and its program both contain {', '.join(both)}.",
+                "A time law is that of the program: what moves a mechanism keeps its time.",
+                do="Give the program a reference of its own with the same path.",
+                references=both,
+            )
+        return {name: path.at_rate(1 / factor, self.t_span[0]) for name, path in self.paths.items()}
+
+    def tried(self, slower, factor, paths=None):
         """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""
         t0, t1 = self.t_span
         try:
             model = derived(self.mechanism, slower, self.guess)
+            model = model.with_references(**paths) if paths else model
             model = model.with_parameters(**self.parameters) if self.parameters else model
             values = {name: value / factor ** _level(model, name) for name, value in self.start.items()}
             start = model.start(t0, guess=self.guess, **values)

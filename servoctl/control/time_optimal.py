@@ -184,6 +184,34 @@ class Inverse:
         return names.index(name), f
 
 
+def in_formulas(q, program, paths):
+    """The program with the paths of its references as formulas of time, along which a law is sought."""
+    if not paths:
+        return program
+    expressions = program.with_turns
+    symbols = [s for s in ca.symvar(ca.vertcat(*expressions.values())) if (place := q.where(s)) and place[0] == "r"]
+    names = [q.family.names[q.where(s)[2]] for s in symbols]
+    for symbol, name in zip(symbols, names, strict=True):
+        if q.where(symbol)[1] or "periodic" in (paths[name].before, paths[name].after) or set(paths) != set(names):
+            raise SpecificationError(
+                f"The program contains {symbol.name()}." if q.where(symbol)[1] else f"The path of {name} is periodic.",
+                "A time-optimal law runs along a curve, h(q) = r, of values from one rest to another.",
+                do="Write residuals h(q) - r with paths that end, or choose shape=False.",
+                name=name,
+            )
+    formulas = [_formula(q.t, paths[name]) for name in names]
+    timed = ca.substitute([*expressions.values()], symbols, formulas)
+    return program.again(dict(zip(expressions, timed, strict=True)), program.weights, program.toward)
+
+
+def _formula(t, path):
+    """A path as an expression of time."""
+    low, high = path.breaks[[0, -1]]
+    t = t if path.before == "continue" else ca.fmax(t, low)
+    t = t if path.after == "continue" else ca.fmin(t, high)
+    return piecewise(t, path.breaks, path.coefficients.transpose(2, 0, 1))
+
+
 @frozen
 class Law:
     """A law s(t): s^(k) T^k at the ends of N equal intervals of a duration T, between which it is linear."""

@@ -311,7 +311,7 @@ def _late(system, plant, delay):
 def _linear_model(model, t, x, name):
     import control
 
-    n, n_x, p = model.n, len(model.state_names), model.parameters
+    n, n_x, p = model.n, len(model.state_names), model.p
     ode = model.function("ode")
     A = jacobian(ode, "x", t, x, p)[:n_x]
     z, to_jets = np.append(x, ode(t, x, p)[n_x - n : n_x]), np.vstack([np.eye(n_x), A[-n:]])

@@ -19,6 +19,7 @@ from servoctl.interop.names import (
     signal_names,
     system_name,
 )
+from servoctl.model.following import p_with
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
 from servoctl.reduction.reduce import require_outputs
@@ -104,8 +105,11 @@ def _model(model, name):
     names = [name for group, _ in groups for name in group]
     ode, symbols = model.function("ode"), model.reduction.mechanism.parameters.names
 
+    def numbers(params):
+        return p_with(model, _parameter_values(p, symbols, params))
+
     def rates(t, x, _, params):
-        y = ode(t, x, _parameter_values(p, symbols, params))[:n_x]
+        y = ode(t, x, numbers(params))[:n_x]
         if not np.isfinite(y).all():
             raise ServoError(
                 f"The reduced dynamics is not finite at t = {t:.6g} s.",
@@ -116,8 +120,8 @@ def _model(model, name):
         return y
 
     def outputs(t, x, u, params):
-        z, numbers = np.append(x, rates(t, x, u, params)[-n:]), _parameter_values(p, symbols, params)
-        return np.concatenate([x, *(f(t, z, numbers) for group, f in groups if group)])
+        z = np.append(x, rates(t, x, u, params)[-n:])
+        return np.concatenate([x, *(f(t, z, numbers(params)) for group, f in groups if group)])
 
     return control.nlsys(
         rates,

@@ -26,6 +26,7 @@ from servoctl.inversion.verdict import HYPERBOLIC_ZEROS, verdict
 from servoctl.markup import Shown
 from servoctl.methods.choice import Bounded
 from servoctl.model.equations import signal_groups
+from servoctl.model.following import corners_of
 from servoctl.model.model import Model
 from servoctl.progress import progress_bar
 from servoctl.run import Run
@@ -366,7 +367,7 @@ class Search:
         p = self.parameters(v)
         model, (first, last, end_slopes) = self.motions.with_parameters(p), self.motions.window(p)
         nodes = first + self.parts * (last - first)
-        t, weights = quadrature([first, *(k for k in model.knots if first < k < last), last], SQUARE_PANELS)
+        t, weights = quadrature([first, *(k for k in corners_of(model) if first < k < last), last], SQUARE_PANELS)
         times, where = np.unique(np.concatenate([nodes, t]), return_inverse=True)
         run = self.motions.run(model, times)
         tangents = sensitivity(run, self.signals, self.motions.names)

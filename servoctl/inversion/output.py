@@ -11,11 +11,13 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import finite, interval, named, require_kind
+from servoctl.codegen.paths import arguments
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
 from servoctl.inversion.zeros import NO_COEFFICIENT, ZeroPolynomial
 from servoctl.methods.kinks import SMOOTHER, kink
 from servoctl.model.model import Model, default_start
 from servoctl.model.start import State
+from servoctl.spec.references import function_of
 from servoctl.tolerances import ENTRY, TINY
 from servoctl.values import frozen
 
@@ -381,10 +383,10 @@ def _losses(model, t, q0):
     constraints = ca.vertcat(*(row.expression for row in held))
     outputs = [constraints, ca.jacobian(constraints, q.jet(0)), ca.substitute(r.leading, jets, ca.SX.zeros(jets.shape))]
     p = ca.vertcat(*r.mechanism.parameters.symbols)
-    rests = ca.Function("rests", [q.t, q.jet(0), p], [ca.densify(e) for e in outputs])
+    rests = function_of(q, r.references, "rests", q.jet(0), p, *map(ca.densify, outputs))
 
     def at(x):
-        return [np.array(part) for part in rests(t, x, model.parameters)]
+        return [np.array(part) for part in rests(*arguments(rests, t, x, model.p))]
 
     both = [x for x in (_first_loss(at, q0, side) for side in (1.0, -1.0)) if x is not None]
     both.sort(key=lambda x: np.linalg.norm(x - q0))

@@ -213,7 +213,7 @@ class Relaxation(Transfer):
         t = np.linspace(*self.span, SAMPLES + 1)
         f = self.node.function("signals", self.node.residuals, self.node.effort).map(len(t))
         v = self._inputs_of(plan, t)
-        residuals, effort = (np.array(part) for part in f(t[None], plan.x @ plan.mesh.of_states(t), v))
+        residuals, effort = (np.array(part) for part in f(self.node.at(t), plan.x @ plan.mesh.of_states(t), v))
         signals = dict(zip((*self.program.names, *self.plant.inputs), (*residuals, *v[: self.m]), strict=True))
         largest = {f"largest {name}": np.abs(values).max() for name, values in signals.items()}
         rms = {f"rms {name}": np.sqrt(np.mean(values**2)) for name, values in signals.items()}
@@ -245,8 +245,8 @@ class Relaxation(Transfer):
     def _mesh(self):
         """Intervals of about the same length between the knots of the program."""
         switches = Switches(self.node.q, self.program.residuals, self.plant.mechanism.parameters.symbols)
-        knots = switches.times(self.plant.parameters, self.span)
-        corners = np.array(breakpoints(self.span, sorted(knots)))
+        knots = [*switches.times(self.plant.parameters, self.span), *self.node.breaks(*self.span)]
+        corners = np.array(breakpoints(self.span, sorted({*knots})))
         counts = np.maximum(1, np.ceil(np.diff(corners) * INTERVALS / np.ptp(corners) * (1 - 1e-9))).astype(int)
         return Mesh(subdivided(corners, counts), ORDER)
 
@@ -269,7 +269,7 @@ class Relaxation(Transfer):
         """Weights (k,) for which standing still costs as much as the actuation of the program."""
         f = self.node.function("residuals", self.node.residuals)
         v = np.concatenate([self.begin_inputs, np.zeros(self.m * self.node.depth)])
-        still = np.hstack([np.array(f(t, self.begin, v)) for t in np.linspace(*self.span, GUESS)])
+        still = np.hstack([np.array(f(self.node.at([t]), self.begin, v)) for t in np.linspace(*self.span, GUESS)])
         moved = np.abs(still).max(axis=1)
         return np.where(moved > 0, moved**2 / self.sizes[3], np.inf)
 
@@ -359,7 +359,7 @@ class Relaxation(Transfer):
         t = (mesh.edges[:-1, None] + mesh.h[:, None] * theta).ravel()
         f = self.node.function("rates", self.node.rates).map(len(t))
         v = self._inputs_of(plan, t)
-        defect = x @ mesh.of_states(t, 1) - np.array(f(t[None], x @ mesh.of_states(t), v))
+        defect = x @ mesh.of_states(t, 1) - np.array(f(self.node.at(t), x @ mesh.of_states(t), v))
         defect *= np.repeat(mesh.h, len(theta)) / state_sizes(x, self.nq, self.span)[:, None]
         return np.abs(defect).max(axis=0).reshape(len(mesh.h), -1).max(axis=1)
 
@@ -384,7 +384,8 @@ class Relaxation(Transfer):
         t = subdivided(mesh.edges, np.full(len(mesh.h), parts))
         x = plan.x @ mesh.of_states(t)
         v = self._inputs_of(plan, t)
-        jets = np.vstack([x, np.array(self.node.function("motion", self.node.acceleration).map(len(t))(t[None], x, v))])
+        motion = self.node.function("motion", self.node.acceleration).map(len(t))
+        jets = np.vstack([x, np.array(motion(self.node.at(t), x, v))])
         if not np.isfinite(model.function("ode").grid(t, x, model.p)).all():
             model = derived_near(model, t[0], jets[:, 0])  # material constraints whose pivot vanishes at the rest
         counters = {"iterations": sum(plan.iterations), "intervals": len(mesh.h), "solves": len(plan.iterations)}

@@ -14,6 +14,7 @@ import numpy as np
 from servoctl.control.nonlinear import solver
 from servoctl.methods.bounded import basis_rates
 from servoctl.methods.radau import basis, radau
+from servoctl.spec.references import Jets, rates_in_time
 from servoctl.values import frozen
 
 WATCHED = 12  # instants of bounds in an interval of the inputs
@@ -40,6 +41,18 @@ class Node:
         values = self._along(self.known(quantities), jets)
         k = residuals.numel()
         self.residuals, self.effort, self.bounded = values[:k], values[k], values[k + 1 :]
+        kinematics = [self.known(each) for each in (self.q.V, self.q.h, plant.mechanism.mass, plant.mechanism.E)]
+        self._jets = Jets(self.q, [values, self.rates, self.acceleration, *kinematics], self.q.family.paths)
+        self.instant = ca.vertcat(self.q.t, self._jets.symbols)
+
+    def at(self, t):
+        """Times (N,) [s] with the references there, as functions take them."""
+        return np.vstack([t, self._jets.at(t)])
+
+    def breaks(self, low, high):
+        """Instants [s] at which the references switch between polynomials, a list."""
+        paths = {name: self.q.family.paths[name].held() for name, _ in self._jets.places}
+        return [t for path in paths.values() for t in path.breaks_below(np.inf, low, high).tolist()]
 
     def known(self, expression):
         """An expression of the mechanism with the plant's numbers."""
@@ -51,14 +64,14 @@ class Node:
         for _ in range(self.depth):
             last = levels[-1]
             moved = sum(ca.jtimes(last, u, du) for u, du in zip(inputs[:-1], inputs[1:], strict=True))
-            levels.append(ca.jacobian(last, self.q.t) + ca.jtimes(last, self.state, self.rates) + moved)
+            levels.append(rates_in_time(self.q, last) + ca.jtimes(last, self.state, self.rates) + moved)
         symbols = ca.vertcat(*(s for k in range(2, 3 + self.depth) for s in self.q.gamma(k)))
         return ca.substitute(quantities, symbols, ca.vertcat(*levels))
 
     def function(self, name, *outputs):
-        """A function of (t, x, v)."""
+        """A function of (t, x, v), where t are times with the references there."""
         outputs = [ca.densify(ca.cse(o)) for o in outputs]
-        return ca.Function(name, [self.q.t, self.state, self.v], outputs, {"der_options": {"cse": True}})
+        return ca.Function(name, [self.instant, self.state, self.v], outputs, {"der_options": {"cse": True}})
 
 
 @frozen
@@ -168,7 +181,7 @@ class Transcription:
         x, points = ca.diag(ca.DM(self.sizes[0])) @ x, ca.diag(ca.DM(self.sizes[1])) @ points
         f = node.function("node", node.rates, node.residuals, node.effort).map(K)
         v = ca.vertcat(*(points @ ca.DM(pieces.of_inputs(mesh.nodes, k)) for k in range(node.depth + 1)))
-        rates, residuals, effort = f(ca.DM(mesh.nodes).T, x[:, 1:], v)
+        rates, residuals, effort = f(ca.DM(node.at(mesh.nodes)), x[:, 1:], v)
         begins = np.repeat(np.arange(0, K, s), s).tolist()
         increments = (x[:, 1:] - x[:, begins]) @ ca.diagcat(*[ca.DM(radau(mesh.order)[1].T)] * len(mesh.h))
         cost = ca.sum1(residuals**2 / ca.repmat(beta, 1, K)) + effort
@@ -180,7 +193,7 @@ class Transcription:
             "slope": slopes / _each(self.sizes[1], len(pieces.nodes)),
             "bound": self._bounded(x, points),
             "start": self.start(mesh.edges[0], x[:, 0]) if self.start else ca.MX(0, 1),
-            "rest": self.rest(mesh.edges[-1], x[:, -1], v[:, -1]) if self.rest else ca.MX(0, 1),
+            "rest": self.rest(node.at(mesh.edges[-1:]), x[:, -1], v[:, -1]) if self.rest else ca.MX(0, 1),
         }
         return w, beta, ca.dot(cost, ca.DM(mesh.weights).T) / (self.sizes[3] * np.sum(mesh.h)), constraints
 
@@ -191,7 +204,7 @@ class Transcription:
             return ca.MX(0, len(t))
         f = node.function("bounded", node.bounded).map(len(t))
         v = ca.vertcat(*(points @ ca.DM(self.pieces.of_inputs(t, k)) for k in range(node.depth + 1)))
-        return f(ca.DM(t).T, x @ ca.DM(self.mesh.of_states(t)), v) / _each(self.sizes[2], len(t))
+        return f(ca.DM(node.at(t)), x @ ca.DM(self.mesh.of_states(t)), v) / _each(self.sizes[2], len(t))
 
     def joined(self, x, points):
         """The variables (n_w,) of states (n_x, 1 + N s) and control points (m, 1 + P s)."""

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import interval, mapping, numbers_by_name, rows_read
+from servoctl.codegen.paths import Followed
 from servoctl.errors import InconsistentStart, LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.inversion.transcription import Node
 from servoctl.methods.bounded import End, FreeEntries
@@ -14,6 +15,7 @@ from servoctl.model.model import derive
 from servoctl.model.rests import RANK, Rests
 from servoctl.model.start import State
 from servoctl.simulation import simulated
+from servoctl.spec.references import Jets, rates_in_time, required_paths
 from servoctl.values import frozen
 
 EXCEEDED = 1e-6  # of a bound: excess between its instants that a run reports, and at the ends that is refused
@@ -137,13 +139,14 @@ class Transfer:
         q = self.node.q
         moving = ca.vertcat(*q.gamma(1), *(s for k in range(2, 3 + self.node.depth) for s in q.gamma(k)))
         orders = {name: q.order(e) for name, e in self.program.residuals.items()}
-        rates = [ca.jacobian(e, q.t) if orders[name] <= 0 else e for name, e in self.program.residuals.items()]
+        rates = [rates_in_time(q, e) if orders[name] <= 0 else e for name, e in self.program.residuals.items()]
         values = ca.substitute(self.node.known(ca.vertcat(*rates)), moving, ca.SX.zeros(moving.numel()))
-        f = ca.Function("rates", [q.t, ca.vertcat(*q)], [values])
+        jets = Jets(q, [values], q.family.paths)
+        f = ca.Function("rates", [q.t, jets.symbols, ca.vertcat(*q)], [values])
         some = np.full(self.nq, 0.3)  # a place where expressions of the coordinates have values
         times = np.linspace(*self.span, 101)
-        along = np.hstack([np.array(f(s, some)) for s in times])
-        at = np.array(f(t, some)).ravel()
+        along = np.hstack([np.array(f(s, r, some)) for s, r in zip(times, jets.at(times).T, strict=True)])
+        at = np.array(f(t, jets.at([t]), some)).ravel()
         moved = np.abs(at) > STANDING * np.abs(along).max(axis=1)
         if moved.any():
             name = list(orders)[int(np.argmax(moved))]
@@ -216,7 +219,9 @@ class Transfer:
         (entries, _, opened), model = found, self._exact_model
         closed = np.linalg.svd(opened)[2][len(opened) :]
         t, x, free = self.node.q.t, self.node.state, entries.free.tolist()
-        on_program = model.function("invariants").expression(t, x, model.parameters)[: entries.m]
+        on_program = model.equations.called(model.function("invariants").expression, x, model.parameters)[: entries.m]
+        jets = Jets(self.node.q, [on_program], model.paths)
+        on_program = ca.substitute(on_program, jets.symbols, jets.at([start.t]))
         rows = ca.vertcat(on_program, ca.DM(closed) @ (x[free] - ca.DM(values[free])))
         return ca.Function("start", [t, x], [ca.densify(ca.cse(rows))], {"der_options": {"cse": True}})
 
@@ -243,11 +248,11 @@ class Transfer:
 
     def _require_bounds_at_ends(self):
         """Refuse bounds that a fixed state at an end exceeds, whatever the inputs."""
-        node, t = self.node, self.span
+        node, t = self.node, np.array(self.span)
         f = node.function("bounded", node.bounded)
         begin = self.begin if self.opening is None else np.full(self.n, np.nan)
         for k, (where, x) in enumerate((("start", begin), ("end", self.target[0]))):
-            values = np.array(f(t[k], x, np.zeros(node.v.numel()))).ravel()
+            values = np.array(f(node.at(t[[k]]), x, np.zeros(node.v.numel()))).ravel()
             for name, value, each in zip(node.bounds, values, node.bounded.elements(), strict=True):
                 low, high = self.bounds[name]
                 excess = max(low - value, value - high)
@@ -271,8 +276,8 @@ class Transfer:
         rows = ca.vertcat(node.acceleration, *(node.known(e) for e in rows.values() if q.order(e) <= 0))
         rows = ca.substitute(rows, q.jet(1), ca.SX.zeros(q.n))
         unknown = ca.vertcat(q.jet(0), node.v[: self.m])
-        slopes = ca.Function("slopes", [q.t, unknown], [ca.densify(ca.jacobian(rows, unknown))])
-        slopes = np.array(slopes(self.span[1], np.concatenate([rest, held])))
+        slopes = ca.Function("slopes", [node.instant, unknown], [ca.densify(ca.jacobian(rows, unknown))])
+        slopes = np.array(slopes(node.at(self.span[1:]), np.concatenate([rest, held])))
         scaled = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300)
         order = qr(scaled.T, pivoting=True)[2][: np.linalg.matrix_rank(scaled, RANK)]
         return node.function("rest", rows[np.sort(order).tolist()])
@@ -308,13 +313,13 @@ class Transfer:
         u_size = np.abs(u).max(axis=1)
         u_size = np.where(u_size > 1e-6 * u_size.max(), u_size, u_size.max() or 1.0)
         v = np.concatenate([u_size, np.zeros(self.m * self.node.depth)])
-        sizes = x_size, u_size, self._bounded_sizes(times, x, u), float(effort(self.span[0], self.begin, v)) or 1.0
-        return x, u, sizes
+        at_start = float(effort(self.node.at(self.span[:1]), self.begin, v)) or 1.0
+        return x, u, (x_size, u_size, self._bounded_sizes(times, x, u), at_start)
 
     def _bounded_sizes(self, times, x, u):
         """Size of each bounded quantity (b,): its largest value along states and inputs, at least that of its sides."""
         v = np.vstack([u, np.zeros((self.m * self.node.depth, len(times)))])
-        values = np.array(self.node.function("bounded", self.node.bounded).map(len(times))(times[None], x, v))
+        values = np.array(self.node.function("bounded", self.node.bounded).map(len(times))(self.node.at(times), x, v))
         sides = np.array([*self.bounds.values()]).reshape(-1, 2)
         both = np.abs(np.hstack([values.reshape(len(sides), len(times)), sides]))
         largest = np.max(both, axis=1, where=np.isfinite(both), initial=0.0)
@@ -337,9 +342,10 @@ class Transfer:
         motion = self.node.function("motion", self.node.acceleration, *forces)
         rate = np.gradient(q, times, axis=1)
         v = np.vstack([u, np.zeros((self.m * self.node.depth, len(times)))])
-        V, h = _at_each(kinematics, times, np.vstack([q, np.zeros((self.n - self.nq, len(times)))]), v)
+        instants = self.node.at(times)
+        V, h = _at_each(kinematics, instants, np.vstack([q, np.zeros((self.n - self.nq, len(times)))]), v)
         w = (np.linalg.pinv(V) @ (rate.T[:, :, None] - h))[:, :, 0].T
-        present, M, E = _at_each(motion, times, np.vstack([q, w]), v)
+        present, M, E = _at_each(motion, instants, np.vstack([q, w]), v)
         inertial = M @ (np.gradient(w, times, axis=1).T[:, :, None] - present)
         u = u + (np.linalg.pinv(E) @ inertial)[:, :, 0].T
         return np.vstack([q, w]), u
@@ -351,15 +357,20 @@ class Transfer:
 
 
 def _at_each(f, t, x, v):
-    """Values of a function of (t, x, v) at instants (N,): an (N, rows, columns) array for each output."""
-    values = f.map(len(t))(t[None], x, v)
-    return [np.array(part).reshape(part.size1(), len(t), -1).swapaxes(0, 1) for part in values]
+    """Values of a function of (t, x, v) at instants (., N): an (N, rows, columns) array for each output."""
+    values = f.map(t.shape[1])(t, x, v)
+    return [np.array(part).reshape(part.size1(), t.shape[1], -1).swapaxes(0, 1) for part in values]
 
 
 def rests(plant, program):
-    """The rests of a plant under a program with any inputs, and the numbers of its parameters."""
+    """The rests of a plant under a program with any inputs, and what their functions take as parameters."""
     numbers = np.array(plant.parameters[: len(plant.mechanism.parameters.names)])
-    return Rests.of_program(plant.mechanism, plant.equations.forces, program), numbers
+    found, paths = Rests.of_program(plant.mechanism, plant.equations.forces, program), plant.mechanism.q.family.paths
+    if not found.references:
+        return found, numbers
+    followed = required_paths({name: paths[name] for name in found.references})
+    found.followed = Followed([path.held() for path in followed.values()])
+    return found, np.append(found.followed.address, numbers)
 
 
 def state_sizes(x, nq, span):

@@ -13,7 +13,7 @@ from servoctl.growth import InternalDynamics, internal_dynamics
 from servoctl.methods.bounded import End, FreeEntries
 from servoctl.methods.choice import Bounded
 from servoctl.methods.kinks import SMOOTHER, kink, stays_on_switch
-from servoctl.model.following import instants_of
+from servoctl.model.following import corners_of, instants_of
 from servoctl.model.model import Model, default_start
 from servoctl.model.start import State
 from servoctl.model.variants import strong_near
@@ -204,7 +204,7 @@ def _rests(model, states, along):
     `along` says whether the states are those of a run, which an unstable rest elsewhere says nothing of.
     """
     (t0, first), (t1, last) = states[0], states[-1]
-    t1 = t1 if along else max((knot for knot in model.knots if knot > t0), default=t0)
+    t1 = t1 if along else max((knot for knot in corners_of(model) if knot > t0), default=t0)
     sides = np.linspace(-1.0, 1.0, 2 * LOOKS + 1) * (-1.0 if t1 < t0 else 1.0)
     places = [("start", t0, first, sides[:LOOKS] if t1 != t0 else sides), ("end", t1, last, sides[LOOKS + 1 :])]
     rest, why = {}, ""

@@ -12,9 +12,12 @@ the relative degree. No rank is decided, and nothing is divided by a pivot.
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen.paths import arguments, evaluated
 from servoctl.errors import InconsistentStart, NotRealisable
+from servoctl.model.following import p_with
 from servoctl.model.rests import Rests
 from servoctl.reduction.ranks import equilibrate
+from servoctl.spec.references import function_of, rates_in_time
 
 NO_COEFFICIENT = 1e-11  # of the largest coefficient: a smaller one is zero
 ON_AXIS = 1e-10  # real part of a root, relative to its size or the usual one, below which it lies on the axis
@@ -41,7 +44,8 @@ class ZeroPolynomial:
 
     def _numbers(self, value):
         names = list(self.model.numbers)
-        return np.where(np.arange(len(names)) == names.index(self.parameter), value, self.model.parameters)
+        numbers = np.where(np.arange(len(names)) == names.index(self.parameter), value, self.model.parameters)
+        return p_with(self.model, numbers)
 
     def _rest(self, value, q):
         """[q; μ] of the equilibrium nearest to coordinates."""
@@ -62,7 +66,7 @@ class ZeroPolynomial:
         z = self._known[self.own]
         q, size = z[: self.nq], 1.0 + np.abs(z[: self.nq]).max(initial=0.0)
         away, moving = np.abs(at.values[: self.nq] - q).max(), np.abs(at.values[self.nq :]).max(initial=0.0)
-        rate = np.abs(self._rates(self.t, q, self._numbers(self.own))).max(initial=0.0)
+        rate = np.abs(evaluated(self._rates, self.t, q, self._numbers(self.own))).max(initial=0.0)
         if max(away, moving) <= MOVED * size and rate <= MOVED:
             return
         nearest = dict(zip(self.model.reduction.mechanism.q.names, q.tolist(), strict=True))
@@ -118,7 +122,8 @@ class ZeroPolynomial:
 
     def _matrices(self, value):
         """Z_0, Z_1, ..."""
-        return [np.array(part) for part in self._parts(self.t, self.equilibrium(value), self._numbers(value))]
+        point = arguments(self._parts, self.t, self.equilibrium(value), self._numbers(value))
+        return [np.array(part) for part in self._parts(*point)]
 
     def _all(self, value):
         """All coefficients of det Z in powers of s over the radius, ascending, from its values on a circle."""
@@ -180,6 +185,7 @@ def _equations(model):
     open_ = ca.SX(rows.numel(), mu.numel())
     parts += [ca.horzcat(ca.jacobian(rows, q.jet(j)), open_) for j in range(1, max(orders) + 1)]
     z, p = ca.vertcat(q.jet(0), mu), ca.vertcat(*r.mechanism.parameters.symbols)
-    rates = ca.densify(ca.substitute(ca.jacobian(rows[len(balance) :], q.t), *rest))
+    rates = ca.densify(ca.substitute(rates_in_time(q, rows[len(balance) :]), *rest))
     matrices = [ca.densify(ca.substitute(part, *rest)) for part in parts]
-    return ca.Function("rates", [q.t, q.jet(0), p], [rates]), ca.Function("Z", [q.t, z, p], matrices), sum(orders)
+    rates = function_of(q, r.references, "rates", q.jet(0), p, rates)
+    return rates, function_of(q, r.references, "Z", z, p, *matrices), sum(orders)

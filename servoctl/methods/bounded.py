@@ -28,6 +28,7 @@ from servoctl.methods.accuracy import component_sizes, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
 from servoctl.model.equations import invariant_names
+from servoctl.model.following import corners_of
 from servoctl.model.jets import with_highest
 from servoctl.model.switching import switching
 from servoctl.tolerances import CUTOFF, NOISE, TINY
@@ -232,7 +233,7 @@ class FreeEntries:
         self.model, self.p = model, model.p
         self._equations = model.once("bounded", lambda: _equations(model))
         self.n_x, self.m = len(model.state_names), len(invariant_names(model))
-        self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *model.knots)
+        self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *corners_of(model))
         self.times = np.linspace(min(ends), max(ends), len(ends) + 9)  # at which is asked what rates depend on
         self._choose(np.array([t]), np.asarray(guess, dtype=float)[:, None], self.n_x - self.m)
 
@@ -415,7 +416,7 @@ class Problem(FreeEntries):
 
     def _wider(self):
         """The span that all knots of the paths lie in; "" if they lie in the present one."""
-        (t0, t1), knots = self.span, self.model.knots
+        (t0, t1), knots = self.span, corners_of(self.model)
         low, high = min(t0, *knots, t1), max(t0, *knots, t1)
         return f"({low:g}, {high:g}), which holds all knots of the paths." if (low, high) != (t0, t1) else ""
 

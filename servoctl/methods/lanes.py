@@ -19,7 +19,6 @@ from servoctl.methods.motion import breakpoints
 from servoctl.methods.narrow import steep
 from servoctl.methods.taylor import FAR_OFF, series_loop
 from servoctl.model.equations import invariant_names
-from servoctl.model.model import knots_within
 from servoctl.model.pivots import pivot_sizes
 from servoctl.model.switching import switching
 
@@ -125,8 +124,8 @@ def plans_fit(model):
     return model.flat and model.once("plans fit", quiet)
 
 
-def plan_many(model, span, cases, times, threads=None, progress=None):
-    """Plans from states x0 (N, n_x) with parameters p (N, n_p), as functions have them, over a span.
+def plan_many(model, span, cases, times, knots, threads=None, progress=None):
+    """Plans from states x0 (N, n_x) with parameters p (N, n_p), as functions have them, over a span with its knots.
 
     The results are those of `integrate`; the last of the times is the end of the span, the largest sizes are zero.
     """
@@ -136,7 +135,7 @@ def plan_many(model, span, cases, times, threads=None, progress=None):
         return None, None, False
     x0, p = cases
     n, n_x = x0.shape
-    cuts = breakpoints(span, knots_within(model, span))
+    cuts = breakpoints(span, knots)
     arrays = {"x0": x0, "p": p, "pivots": pivot_sizes(model), "times": times, "cuts": cuts}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= _results(n, len(times), n_x)

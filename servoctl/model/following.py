@@ -1,5 +1,6 @@
 """The paths that a model follows: what its motion needs of them, and the instants at which its steps end."""
 
+from itertools import chain
 from math import factorial
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.model.points import with_place
+from servoctl.spec.references import required_paths
 
 SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
 
@@ -71,3 +73,9 @@ def instants_of(model, t):
         sizes = np.array([[factorial(k)] for k in range(order + 1)], dtype=float)
         result[:, family.names.index(name), : order + 1] = (path.jets(t, order)[:, 0] / sizes).T
     return np.column_stack([np.asarray(t, dtype=REAL), result.reshape(len(t), -1)])
+
+
+def corners_of(model):
+    """Instants at which paths switch between smooth pieces, with the breaks of those that references follow."""
+    paths = required_paths(model.paths).values()
+    return tuple(sorted({*model.knots, *chain.from_iterable(path.breaks[np.isfinite(path.classes)] for path in paths)}))

@@ -14,7 +14,7 @@ from servoctl.codegen.paths import evaluated
 from servoctl.errors import InconsistentStart, ServoError, SingularProgram
 from servoctl.jets.branches import shown
 from servoctl.model.equations import gradient_jets, invariant_names
-from servoctl.model.following import instants_of
+from servoctl.model.following import corners_of, instants_of
 from servoctl.model.start import SPANNED, TOLERANCE, Aim, JetEquations, State, consistent, free_names, gauss_newton
 from servoctl.model.variants import derived_near
 from servoctl.progress import stage
@@ -173,7 +173,7 @@ def _first_start(model, t, chosen):
 
 def _later(model, t):
     """Instants [s] after t, farther and farther, up to a quarter of the time to the next knot."""
-    length = min((knot - t for knot in model.knots if knot > t), default=1.0)
+    length = min((knot - t for knot in corners_of(model) if knot > t), default=1.0)
     return [t + tau * length for tau in LATER]
 
 

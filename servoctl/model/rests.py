@@ -11,7 +11,7 @@ import numpy as np
 
 from servoctl.codegen.paths import arguments
 from servoctl.reduction.rows import Row
-from servoctl.spec.references import function_of
+from servoctl.spec.references import function_of, names_in
 from servoctl.tolerances import ENTRY, TINY
 
 NEWTON = 25  # steps
@@ -31,7 +31,7 @@ class Rests:
     def __init__(self, mechanism, balance, B, rows, references=()):
         q = mechanism.q
         rows = {name: e for name, e in (rows | mechanism.followers).items() if q.order(e) <= 0}
-        self.coordinates, self.nq, self.n = q.names, q.nq, q.n
+        self.coordinates, self.nq, self.n, self.references = q.names, q.nq, q.n, references
         self.zero = {name: q.identity.get(name, 0.0) for name in q.names}
         self.names = (*(f"balance of {name}" for name in q.force_names), *rows)
         mu, p = ca.SX.sym("mu", B.shape[1]), ca.vertcat(*mechanism.parameters.symbols)
@@ -58,7 +58,8 @@ class Rests:
         B = ca.horzcat(
             mechanism.E, *(Row(e, max(q.order(e), 0), name, "material").gradient(q).T for name, e in material.items())
         )
-        return cls(mechanism, mechanism.balance - forces, B, {**material, **program.residuals})
+        rows, balance = {**material, **program.residuals}, mechanism.balance - forces
+        return cls(mechanism, balance, B, rows, names_in(q, [balance, B, *rows.values()]))
 
     def measured(self, t, z, p):
         """The rows (e,) at [q; μ], their slopes (e, z) and the rows relative to these and to the state."""

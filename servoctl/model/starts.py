@@ -8,7 +8,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.model.equations import invariant_names
-from servoctl.model.following import p_with
 from servoctl.reduction.manifold import WELL_CONDITIONED
 
 PASSES = 2  # Newton steps of each level: one solves it, another one takes what rounding left
@@ -53,8 +52,8 @@ def same_start(model, held, parameters):
 def linear_starts(model, t, held, p):
     """States (N, n_x) at time t [s] with held values, and whether each is the only one with these values, (N,).
 
-    `held` is a dict of str to (N,) array, the parameters p are (N, n_p). A state that is not the only one means
-    nothing.
+    `held` is a dict of str to (N,) array, the parameters p are (N, n_p) as functions have them. A state that is not
+    the only one means nothing.
     """
     states, solved = np.zeros((len(p), len(model.state_names))), np.zeros(len(p), bool)
     levels = model.once(f"linear levels {sorted(held)}", lambda: linear_levels(model, tuple(held)))
@@ -66,7 +65,7 @@ def linear_starts(model, t, held, p):
     solved[:] = True
     with np.errstate(all="ignore"):
         for rows, unknown in (level for level in levels for _ in range(PASSES)):
-            y = f.grid(t, states.T, p_with(model, p.T))
+            y = f.grid(t, states.T, p.T)
             jacobian = y[m:].reshape(states.shape[1], m, -1)[np.ix_(unknown, rows)].transpose(2, 1, 0)
             sizes = np.linalg.norm(jacobian, axis=2)
             scaled, off = jacobian / sizes[:, :, None], y[rows].T / sizes

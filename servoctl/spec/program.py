@@ -9,6 +9,7 @@ from servoctl.jets.branches import as_text, without_turns
 from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import Packed
+from servoctl.spec.references import names_in
 
 REALISATIONS = ("ideal", "actuators")
 
@@ -115,10 +116,29 @@ class Program(Packed):
         Raises
         ------
         SpecificationError
-            If the factor is not positive, or the kinematics q' = V w + h depend on time or drift by h.
+            If the factor is not positive, the kinematics q' = V w + h depend on time or drift by h, or the program
+            follows references, whose paths are slowed.
         """
         require_kind(Coordinates, "q", q, "sv.coordinates(...)")
         sigma, instant = positive("factor", factor), finite("at", at, "instant")
+        if names := self.references(q):
+            slower = f"{names[0]}=path.at_rate({1 / sigma:.6g}, about={instant:g})"
+            raise SpecificationError(
+                f"The program follows {', '.join(names)}.",
+                "A program has its formulas of time; the time of references runs in their paths.",
+                nearest=f"model.with_references({slower}).",
+                do="Derive the program once, and pass slower paths.",
+                references=names,
+            )
+        return self.slower(q, sigma, instant)
+
+    def references(self, q):
+        """Names of the references that residuals, weights and wishes contain, in the order in which they were made."""
+        parts = self.with_turns, self.weights, self.toward
+        return names_in(q, [ca.SX(value) for part in parts for value in part.values()])
+
+    def slower(self, q, sigma, instant):
+        """The program of `slowed`, whose references follow paths that are slowed alike."""
         if not q.plain and (not q.h.is_zero() or ca.depends_on(q.V, q.t)):
             raise SpecificationError(
                 "The kinematics q' = V w + h depend on time or drift by h.",
@@ -131,6 +151,10 @@ class Program(Packed):
         for k in range(1, max(map(q.order, (*self.with_turns.values(), *weights.values()))) + 1):
             symbols += q.gamma(k)
             values += [sigma**k * s for s in q.gamma(k)]
+        for symbol in ca.symvar(ca.vertcat(*self.with_turns.values(), *weights.values())):
+            place = q.where(symbol)
+            if place and place[0] == "r" and place[1]:
+                symbols, values = [*symbols, symbol], [*values, sigma ** place[1] * symbol]
         slower = iter(ca.substitute([*self.with_turns.values(), *weights.values()], symbols, values))
         residuals = {name: next(slower) for name in self.residuals}
         weights = {name: next(slower) for name in weights}

@@ -10,6 +10,7 @@ from servoctl.checks import named, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS
 from servoctl.spec.paths.scipy_paths import as_path
+from servoctl.spec.paths.value import Path
 
 _lock = threading.Lock()
 
@@ -179,7 +180,7 @@ def required_paths(paths):
 
 def followed_path(name, path):
     """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
-    path = None if path is None else as_path(path)
+    path = path if path is None or isinstance(path, Path) else as_path(path)
     if path is not None and path.dim != 1:
         raise SpecificationError(
             f"The path of the reference {name!r} has {path.dim} components.",
@@ -190,3 +191,13 @@ def followed_path(name, path):
             components=path.dim,
         )
     return path
+
+
+def rates_in_time(q, expressions):
+    """The partial derivatives (n,) of SX expressions (n,) by the time, along the paths of their references."""
+    rates = ca.jacobian(expressions, q.t)
+    for symbol in ca.symvar(expressions):
+        place = q.where(symbol)
+        if place and place[0] == "r":
+            rates += ca.jacobian(expressions, symbol) * q.family.jet(q.family.names[place[2]], place[1] + 1)
+    return rates

@@ -7,14 +7,13 @@ from concurrent.futures import Executor
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_numbers, as_span, mapping, meant, plain, require_kind, whole
+from servoctl.checks import as_list, as_numbers, as_span, by_name, mapping, meant, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
 from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
-from servoctl.model.following import p_with
 from servoctl.model.model import Model, including, knots_within
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
@@ -22,6 +21,8 @@ from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
+from servoctl.spec.paths.value import Path
+from servoctl.spec.references import followed_path
 from servoctl.study.batch import FINAL, Batch, failure, of_finished
 from servoctl.study.cases import as_columns
 from servoctl.study.executor import computed, require_some, whole_run
@@ -37,6 +38,7 @@ def simulate_many(
     t_span: Sequence[float],
     method: Method | str | None = None,
     *,
+    paths: Mapping[str, Sequence[object]] | None = None,
     t_eval: ArrayLike | None = None,
     executor: Executor | int | None = None,
     progress: bool | None = None,
@@ -62,6 +64,8 @@ def simulate_many(
         [s]; t1 < t0 runs backwards.
     method : Method or str, optional
         Default: `sv.methods.Taylor()`; for a program that determines the motion completely "algebraic".
+    paths : dict of str to sequence of Path, optional
+        Paths of each case by the names of references, as for `Model.with_references`; default: those of the model.
     t_eval : (K,) array, optional
         Times of the traces [s]; default: no traces.
     executor : int or concurrent.futures.Executor, optional
@@ -79,9 +83,9 @@ def simulate_many(
     Raises
     ------
     NameUnknown
-        For a name that is no parameter.
+        For a name that is no parameter, or no reference.
     SpecificationError
-        If the cases form no table, or executor, method or times are invalid.
+        If the cases form no table, a path is none of one component, or executor, method or times are invalid.
     ServoError
         If the workers of the executor died before they finished a case.
     """
@@ -92,7 +96,7 @@ def simulate_many(
     method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
     times = sample_times(*span, t_eval, ()).copy() if np.size(t_eval) and t_eval is not None else np.array([])
     all_times = times if len(times) and times[-1] == span[1] else np.append(times, span[1])
-    motions = _Many(model, *_case_table(model, starts, parameters), len(all_times))
+    motions = _Many(model, *_case_table(model, starts, parameters, paths), len(all_times))
     with progress_bar("simulate_many", progress, motions.n, unit="case") as bar:
 
         def show(count):
@@ -110,15 +114,16 @@ def simulate_many(
 def _share_computed(part, span, method, times):
     """A part of the cases with its results, computed by a worker."""
     part.compute(span, method, times, 1, lambda count: None)
-    part.models = {}
+    part.models, part.followers = {}, None
     return part
 
 
-def _case_table(model, starts, parameters):
-    """Number of cases; their parameters by name; one start, starts by name, or states (N, n_x)."""
+def _case_table(model, starts, parameters, paths):
+    """Number of cases; parameters and paths by name; one start, starts by name, or states (N, n_x)."""
     columns = {} if parameters is None or isinstance(parameters, dict) and not parameters else as_columns(parameters)
     columns = {meant(name, model.numbers, "parameter") or name: column for name, column in columns.items()}
-    lengths = {len(column) for column in columns.values()}
+    paths = _columns_of_paths(model, paths)
+    lengths = {len(column) for column in (*columns.values(), *paths.values())}
     if isinstance(starts, Mapping):
         starts = {name: as_numbers(values) for name, values in mapping(starts, "The starts").items()}
         valid = all(values.ndim < 2 and np.isfinite(values).all() for values in starts.values())
@@ -130,32 +135,64 @@ def _case_table(model, starts, parameters):
     n = max(lengths, default=1)
     if not isinstance(starts, State) and not valid or len(lengths) > 1 or 0 in lengths:
         raise SpecificationError(
-            f"The starts and parameters have the lengths {', '.join(map(str, sorted(lengths))) or '(none)'}.",
+            f"The starts, parameters and paths have the lengths {', '.join(map(str, sorted(lengths))) or '(none)'}.",
             f"A state has {len(model.state_names)} finite entries, and all columns have one number for each case.",
             do="Pass one start for all cases, or as many as there are sets of parameters.",
             lengths=sorted(lengths),
             names=model.state_names,
         )
-    return n, columns, starts
+    return n, columns, paths, starts
+
+
+def _columns_of_paths(model, paths):
+    """Lists of the paths of each case by name."""
+    columns = by_name(mapping(paths, "The paths"), model.paths, "reference", "The paths")
+    for name, column in columns.items():
+        if isinstance(column, Path) or as_list(column) is None:
+            raise SpecificationError(
+                f"The paths of {name} are {column!r}."[:200],
+                "They are a list with a path for each case.",
+                do=f"Write {{{name!r}: [path, ...]}}, or model.with_references({name}=path) for one path in all cases.",
+                name=name,
+            )
+    return {name: [followed_path(name, path) for path in column] for name, column in columns.items()}
 
 
 class _Many:
     """The cases, and what is known of their motions so far."""
 
-    def __init__(self, model, n, columns, starts, n_times):
+    def __init__(self, model, n, columns, paths, starts, n_times):
         self.model, self.n, self.columns, self.starts, self.models = model, n, columns, starts, {}
+        self.paths, self.followers, self.knots = paths, None, []
         self.interrupted, n_x = False, len(model.state_names)
         self.done, self.steps, self.errors, self.runs = np.zeros(n, bool), np.full(n, np.nan), {}, {}
         self.parameters = np.tile(model.parameters, (n, 1))
         self.samples = np.full((n, n_times, n_x), np.nan)  # the last one at the end
 
     def model_of(self, i):
-        """The model with the parameters of a case; each set of parameters is checked once."""
+        """The model with the parameters and paths of a case; each set of parameters is checked once."""
         case = {name: plain(column[i]) for name, column in self.columns.items()}
         key = tuple(case.values())
         if key not in self.models:
             self.models[key] = self.model.with_parameters(**case) if case else self.model
-        return self.models[key]
+        return self.models[key].with_references(**self.paths_of(i)) if self.paths else self.models[key]
+
+    def paths_of(self, i):
+        """The paths of a case."""
+        return {name: column[i] for name, column in self.paths.items()}
+
+    def along(self, which):
+        """The models that follow the paths of some cases, with the parameters of the model: made once, and kept."""
+        if not self.paths:
+            return [self.model] * len(which)
+        if self.followers is None:
+            self.followers = [self.model.with_references(**self.paths_of(i)) for i in range(self.n)]
+        return [self.followers[i] for i in which]
+
+    def numbers(self, which, p):
+        """Parameters p (N, n_p) of some cases as functions have them: after the places of the paths."""
+        places = [model.p[: len(model.p) - p.shape[1]] for model in self.along(which)]
+        return np.hstack([np.array(places).reshape(len(p), -1), p])
 
     def start(self, i, model, t):
         """The start of a case."""
@@ -195,7 +232,8 @@ class _Many:
             starts = {name: values[which] if values.ndim else values for name, values in starts.items()}
         elif np.ndim(starts) == 2:
             starts = starts[which]
-        return _Many(self.model, len(which), columns, starts, self.samples.shape[1])
+        paths = {name: [column[i] for i in which] for name, column in self.paths.items()}
+        return _Many(self.model, len(which), columns, paths, starts, self.samples.shape[1])
 
     def _join(self, which, part):
         """Take the results of a part."""
@@ -224,11 +262,17 @@ class _Many:
     def plans(self, span, times, threads, progress):
         """Compute the plans whose pivots do not fall."""
         which, x0, p = self._prepared(span)
-        cases = x0, p_with(self.model, p.T).T
-        ends, samples, self.interrupted = plan_many(self.model, span, cases, times, threads, progress)
-        if ends is not None:
-            good = ends[:, 0] > 0
-            self._take(which[good], ends[good], samples[good])
+        groups = {} if self.paths else {knots_within(self.model, (min(span), max(span))): range(len(which))}
+        for k, i in enumerate(which.tolist() if self.paths else ()):
+            groups.setdefault(self.knots[i], []).append(k)
+        for knots, some in groups.items():
+            cases = x0[some], self.numbers(which[some], p[some])
+            ends, samples, self.interrupted = plan_many(self.model, span, cases, times, knots, threads, progress)
+            if ends is not None:
+                good = ends[:, 0] > 0
+                self._take(which[some][good], ends[good], samples[good])
+            if self.interrupted:
+                return
 
     def _take(self, which, ends, samples):
         """Take what was computed for some cases."""
@@ -237,7 +281,7 @@ class _Many:
     def _prepared(self, span):
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
         t, span = span[0], (min(span), max(span))
-        knots = knots_within(self.model, span)
+        knots = () if self.paths else knots_within(self.model, span)
         p, x = self.parameters, np.empty((self.n, len(self.model.state_names)))
         ready = self._affirmed(p)
         try:
@@ -247,23 +291,39 @@ class _Many:
         for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
                 model = self.model_of(i)
-                if model.reduction is self.model.reduction and knots_within(model, span) == knots:
+                if model.reduction is self.model.reduction and (self.paths or knots_within(model, span) == knots):
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
+        ready &= self._smooth(span) if self.paths else True
         which = np.flatnonzero(ready)
         return which, x[which], p[which]
+
+    def _smooth(self, span):
+        """Cases (N,) whose paths are smooth enough within a span, whose knots are kept; other cases become errors."""
+        models, smooth = self.along(range(self.n)), np.ones(self.n, bool)
+        self.knots = [()] * self.n
+        for i, model in enumerate(models):
+            try:
+                self.knots[i] = knots_within(model, span)
+            except ServoError:
+                smooth[i] = False
+        return smooth
 
     def _started(self, t, x, p):
         """Cases (N,) whose states x (N, n_x) follow for all cases at once; these are set."""
         if not isinstance(self.starts, dict):
             x[:] = as_state(self.model, self.starts, t) if isinstance(self.starts, State) else self.starts
-        elif all(v.ndim == 0 for v in self.starts.values()) and same_start(self.model, self.starts, self.columns):
+        elif not self.paths and self._same_start():
             x[:] = self.start(0, self.model, t).values
         else:
             held = {name: np.broadcast_to(values, self.n) for name, values in self.starts.items()}
-            x[:], solved = linear_starts(self.model, t, held, p)
+            x[:], solved = linear_starts(self.model, t, held, self.numbers(range(self.n), p))
             return solved
         return np.ones(self.n, bool)
+
+    def _same_start(self):
+        values = all(v.ndim == 0 for v in self.starts.values())
+        return values and same_start(self.model, self.starts, self.columns)
 
     def _affirmed(self, p):
         """Cases (N,) for which double precision affirms the derivation; their parameters p (N, n_p) are set."""
@@ -322,4 +382,4 @@ class _Many:
         """The signals of the finished cases at the instants t, of which the first so many are those of the traces."""
         runs = {k: self.runs[i] for k, i in enumerate(which.tolist()) if i in self.runs}
         states, p = self.samples[which].transpose(2, 1, 0), self.parameters[which].T
-        return Signals(self.model, t, count, states, p, level, runs)
+        return Signals(self.along(which), self.model, t, count, states, p, level, runs)

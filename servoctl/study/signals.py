@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from servoctl.model.equations import signal_groups
-from servoctl.model.following import p_with
 from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.run import ByName, Run
 
@@ -17,11 +16,11 @@ class Signals(ByName, Mapping):
 
     `t` has the instants [s], then the end of the motions if that is none of them; `states` (n_x, K or K + 1, N) are
     those at `t`, NaN for motions that ended early, and `parameters` are (n_p, N) in SI. `level` is the highest order of
-    the jets, and `runs` are motions that have models of their own, by index.
+    the jets, and `runs` are motions that have models of their own, by index; `models` follow the paths of each motion.
     """
 
-    def __init__(self, model, t, count, states, parameters, level, runs):
-        self._model, self._t, self._count, self._runs = model, t, count, runs
+    def __init__(self, models, model, t, count, states, parameters, level, runs):
+        self._models, self._model, self._t, self._count, self._runs = models, model, t, count, runs
         self._states, self._parameters = states, parameters
         self._jet_names = jet_names_to(model, model.nq + level * model.n)
         self._values = dict(zip(model.state_names, states, strict=True))
@@ -61,7 +60,9 @@ class Signals(ByName, Mapping):
     def _evaluated(self, f, part):
         """A function of the jets, or the highest of these, (n, K, N) for some motions."""
         model, count = self._model, len(part)
-        t, p = np.repeat(self._t, count), np.tile(p_with(model, self._parameters[:, part]), len(self._t))
+        t, numbers = np.repeat(self._t, count), self._parameters[:, part]
+        places = [self._models[i].p[: len(model.p) - len(numbers)] for i in part]
+        p = np.tile(np.vstack([np.array(places).reshape(count, -1).T, numbers]), len(self._t))
         jets = with_highest(model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
         y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
         return y.reshape(len(y), len(self._t), count)
@@ -72,7 +73,7 @@ class Signals(ByName, Mapping):
         if i in self._runs or np.isnan(states).any():
             return self._runs.get(i)
         values = dict(zip(self._model.numbers, self._parameters[:, i].tolist(), strict=True))
-        model = self._model.with_parameters(**values)
+        model = self._models[i].with_parameters(**values)
         jets = with_highest(model, self._t, states)
         if len(self._jet_names) > len(jets):
             jets = extended(model, self._t, jets, len(self._jet_names))

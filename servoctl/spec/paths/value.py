@@ -160,7 +160,12 @@ class Path(Value):
 
     def held(self):
         """The path that is held outside where nothing was said of it."""
-        return self._with(before=self.before or "hold", after=self.after or "hold")
+        if self.before and self.after:
+            return self
+        found = object.__new__(Path)  # whose other fields need no check
+        rules = {"before": self.before or "hold", "after": self.after or "hold", "remark": ""}
+        found.__dict__.update(self.__dict__ | rules)
+        return found
 
     def breaks_below(self, smooth, low, high):
         """Instants (N,) from `low` to `high` at which fewer than `smooth` derivatives are continuous."""
@@ -248,20 +253,22 @@ class Path(Value):
         classes = np.concatenate([self.classes[:-1], [joined], other.classes[1:]])
         return Path(breaks, coefficients, classes, self.before, other.after)
 
-    def at_rate(self, factor):
-        """The path along a clock that runs faster, from the same first instant on.
+    def at_rate(self, factor, about=None):
+        """The path along a clock that runs faster.
 
         Parameters
         ----------
         factor : float
             Positive; 2 halves the time that it takes.
+        about : float, optional
+            The instant at which both clocks agree [s]; default: the first one of the path.
 
         Returns
         -------
         Path
         """
-        first = self.breaks[0]
-        return self._with(breaks=first + (self.breaks - first) / positive("factor", factor))
+        fixed = self.breaks[0] if about is None else finite("about", about, "instant")
+        return self._with(breaks=fixed + (self.breaks - fixed) / positive("factor", factor))
 
     def plot(self, order=2):
         """Draw the path and its derivatives over its span.
