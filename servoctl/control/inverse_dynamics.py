@@ -435,9 +435,10 @@ def _require_smooth(plan, orders):
 
 def _require_class(plan, name, order, reference):
     """Refuse a path with fewer continuous derivatives than a residual's error dynamics need."""
-    path = plan.model.paths[reference].held()
-    if len(rough := path.breaks_below(order, plan.t[0], plan.t[-1])):
-        has = int(path.classes[np.searchsorted(path.breaks, rough[0])])
+    for has in range(-1, order):
+        rough = plan.model.paths[reference].held().breaks_below(has + 1, plan.t[0], plan.t[-1])
+        if not len(rough):
+            continue
         raise SpecificationError(
             f"The path of {reference!r} in {name!r} needs C^{order}, has {f'C^{has}' if has >= 0 else 'a jump'} at "
             f"t = {rough[0]:.6g}.",

@@ -178,6 +178,13 @@ def _require_free(plant):
             do="Write the mechanism in coordinates without material constraints.",
             invariants=plant.constraint_names(),
         )
+    if plant.paths:
+        raise SpecificationError(
+            f"The equations of the plant contain the references {', '.join(plant.paths)}.",
+            "A plant is identified from inputs and measurements; the paths of its own equations are no part of these.",
+            do="Write them as formulas of q.t, such as sv.paths.rest_to_rest(q.t, ...), in the mechanism.",
+            references=tuple(plant.paths),
+        )
 
 
 def _places(plant):
