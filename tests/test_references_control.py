@@ -199,6 +199,8 @@ def test_a_mass_in_a_wind():
     assert np.abs(closed["jerk"] - path.jets(closed.t, 1)[1, 0] / 2).max() < 1e-12
     with refused(SpecificationError, "W", references=("W",)):
         sv.identify(plant, [closed], ["M"])
+    with refused(SpecificationError, "W", references=("W",)):
+        sv.relaxed(plant, sv.Program({"X": x}, by="actuators"), (0.0, 1.0))
     with refused(NameUnknown, "V", "W"):
         plant.with_references(V=path)
 

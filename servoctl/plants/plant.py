@@ -146,6 +146,17 @@ def made_again(whole, mechanism, **of_actuators):
     return again.with_references(**{name: whole.paths[name] for name in again.paths})
 
 
+def refuse_references(plant, what):
+    """Refuse a plant whose own equations contain references; `what` begins the rule: "The identification is"."""
+    if plant.paths:
+        raise SpecificationError(
+            f"The equations of the plant contain the references {', '.join(plant.paths)}.",
+            f"{what} that of a plant whose equations contain t, its states, inputs and parameters alone.",
+            do="Write formulas of q.t in the mechanism instead.",
+            references=tuple(plant.paths),
+        )
+
+
 @frozen(eq=False)
 class Plant(Value, Shown):
     """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.

@@ -18,7 +18,7 @@ from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, SpecificationError
 from servoctl.markup import Shown
 from servoctl.plants.equations import equations_at
-from servoctl.plants.plant import Plant
+from servoctl.plants.plant import Plant, refuse_references
 from servoctl.run import ByName
 from servoctl.sensitivities.records import as_records
 from servoctl.tolerances import TINY
@@ -178,13 +178,7 @@ def _require_free(plant):
             do="Write the mechanism in coordinates without material constraints.",
             invariants=plant.constraint_names(),
         )
-    if plant.paths:
-        raise SpecificationError(
-            f"The equations of the plant contain the references {', '.join(plant.paths)}.",
-            "A plant is identified from inputs and measurements; the paths of its own equations are no part of these.",
-            do="Write them as formulas of q.t, such as sv.paths.rest_to_rest(q.t, ...), in the mechanism.",
-            references=tuple(plant.paths),
-        )
+    refuse_references(plant, "The identification is")
 
 
 def _places(plant):
