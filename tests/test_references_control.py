@@ -10,6 +10,7 @@ from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import NameUnknown, SpecificationError
+from servoctl.spec.shapes import heights, moved
 
 ROUNDING = 1e-11  # of each signal's largest value, after 200 samples under a law
 SPAN = (0.0, 2.0)
@@ -213,3 +214,29 @@ def test_exact_linearisation_needs_smooth_paths():
     assert sv.computed(scene.run, sv.plant(mechanism)).info["orders"] == {"X": 2}
     with refused(SpecificationError, "X", reference="X", needs=3, has=2, t=0.0):
         sv.computed(scene.run, sv.plant(mechanism, lag={"u": 0.1}))
+
+
+def test_shapes_and_heights_along_references():
+    """A target is drawn where the path is; a weight that hangs from a moving support shows what is up."""
+    q, p = sv.coordinates("x z"), sv.parameters(M=1.0, g=9.81)
+    x, z = q
+    path = sv.paths.rest_to_rest(start=0.0, end=1.0, duration=1.0)
+    X, B = q.references(X=path, B=path)
+    mechanism = sv.Mechanism(
+        q,
+        sv.particle(q, p.M, [x, z]),
+        p.M * p.g * (z + B),
+        {"u": x, "v": z},
+        p,
+        outputs={"height": z + B},
+        shapes={"target": [(X, 0), (x, z)]},
+    )
+    model = sv.derive(mechanism, sv.Program({"X": x - X, "Z": z}, by="actuators"))
+    other = model.with_references(X=2 * path)
+    run, t = sv.simulate(other, other.start(), (0.0, 1.0)), np.array([0.0, 0.5, 1.0])
+    drawn = moved(mechanism, t, np.zeros((2, 3)), model.parameters, other.paths)["target"]
+    assert np.array_equal(drawn[:, 0], [2 * path(t), np.zeros(3)])
+    assert heights(mechanism, ["height"], run.t, run.jets[:2], run.model.parameters, run.model.paths) == [1]
+    closed = sv.close(sv.plant(mechanism), sv.lqr(run, sv.plant(mechanism)), run.jets[:4, 0], (0.0, 0.5))
+    for motion in (run, closed):
+        assert sv.figures.stroboscope(motion) is not None
