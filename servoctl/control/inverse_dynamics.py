@@ -116,8 +116,8 @@ class _Extension:
 
     def __init__(self, plant, residuals, paths, points, along):
         e = plant.equations
-        q, self.parameters, self._paths = e.q, plant.parameters, paths
-        self.q = q
+        self.q = q = e.q
+        self.parameters, self._paths = plant.parameters, paths
         self.t, self.x, self.names, self.points, self.along = q.t, e.state, tuple(residuals), points, along
         self.numbers = e.p[: e.p.numel() - e.u.numel() - q.n]
         undisturbed = [ca.substitute(part, e.d, ca.SX.zeros(q.n)) for part in (e.state_rates, e.acceleration)]

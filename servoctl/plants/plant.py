@@ -274,12 +274,6 @@ class Plant(Value, Shown):
         fixed, d = (np.repeat(part[:, None], u.shape[1], axis=1) for part in (fixed, d))
         return np.concatenate([fixed, u, d])  # u is NaN where a motion ended
 
-    def p_of_cases(self, constants, u=None):
-        """The vectors p (n_p, N) of cases with other parameters (n_c, N) and the same inputs u (m,), default 0."""
-        p = np.repeat(self.p(u)[:, None], constants.shape[1], axis=1)
-        p[self.at_u - len(constants) : self.at_u] = constants
-        return p
-
     def disturbed(self, name):
         """The index in p of what a disturbance acts on.
 
