@@ -71,7 +71,7 @@ def _derived(plant, law, disturbed, residuals):
     t, x, p, followed, rates = _rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], *(p[i] for i in disturbed))
     still = ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed))
-    place = p[: n_c - len(plant.parameters)]
+    place = ca.vertcat(ca.SX(0, 1), *p.elements()[: n_c - len(plant.parameters)])
     f, w, w_values = _fastest((t, x, p, rates, followed), place, still, applied)
     t_k, row, written, common_values = _law_in_c(law)
     r = ca.SX.sym("r", len(residuals.jets) if residuals else 0)
@@ -199,7 +199,7 @@ class Gathered:
 def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, step=None):
     """Run the closed loops of N cases: `Gathered`, or None without a compiler.
 
-    `loop` holds for all cases, without its x0 and noise. `cases` are parameters of the plant (n_c, N), initial
+    `loop` holds for all cases, without its p, x0 and noise. `cases` are parameters of the plant (n_c, N), initial
     states (n_x, N) and factors of the disturbances (n_d, N); `noise` are standard deviations of the measurements (n_y,)
     and keys of the cases (N, 2). `step` is the C function of a law that is called.
     `traced` are indices of quantities that are traced at every n-th sample. By default there is one thread per core;
@@ -219,7 +219,7 @@ def run_batch(unit, loop, cases, noise=None, traced=(), every=1, threads=None, s
     depth = 1 + max(loop.delay, late)
     constants, x0, scale = (part[:, columns] for part in cases)
     deviations, keys = noise or (None, None)
-    given = {"constants": constants, "x0": x0, "scale": scale, "table": _common(unit, loop), "depth": depth}
+    given = {"constants": constants, "x0": x0, "scale": scale, "p": None, "table": _common(unit, loop), "depth": depth}
     given |= {"deviations": deviations, "keys": None if keys is None else keys[columns]}
     given |= {"law": step and ctypes.cast(step, ctypes.c_void_p), "columns": blocks * width, "every": every}
     given |= {"traced": traced, "n_traced": len(traced), "gathered": gathered, "trace": trace}

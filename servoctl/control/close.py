@@ -126,6 +126,7 @@ def loop_of(plant, law, x0, t_span, conditions):
         at_u=plant.at_u,
         t0=t0,
         period=law.period,
+        p=plant.p()[plant.place.size :],
         x0=x0,
         z0=law.state,
         table=law.schedule.T,

@@ -116,8 +116,8 @@ class _Extension:
 
     def __init__(self, plant, residuals, paths, points, along):
         e = plant.equations
-        q, self.parameters, self._paths = e.q, plant.parameters, paths
-        self.q = q
+        self.q = q = e.q
+        self.parameters, self._paths = plant.parameters, paths
         self.t, self.x, self.names, self.points, self.along = q.t, e.state, tuple(residuals), points, along
         self.numbers = e.p[: e.p.numel() - e.u.numel() - q.n]
         undisturbed = [ca.substitute(part, e.d, ca.SX.zeros(q.n)) for part in (e.state_rates, e.acceleration)]
@@ -435,9 +435,10 @@ def _require_smooth(plan, orders):
 
 def _require_class(plan, name, order, reference):
     """Refuse a path with fewer continuous derivatives than a residual's error dynamics need."""
-    path = plan.model.paths[reference].held()
-    if len(rough := path.breaks_below(order, plan.t[0], plan.t[-1])):
-        has = int(path.classes[np.searchsorted(path.breaks, rough[0])])
+    for has in range(-1, order):
+        rough = plan.model.paths[reference].held().breaks_below(has + 1, plan.t[0], plan.t[-1])
+        if not len(rough):
+            continue
         raise SpecificationError(
             f"The path of {reference!r} in {name!r} needs C^{order}, has {f'C^{has}' if has >= 0 else 'a jump'} at "
             f"t = {rough[0]:.6g}.",

@@ -30,6 +30,7 @@ class Loop(Value):
     at_u: int  # index of the first input in p
     t0: float  # [s]
     period: float  # [s]
+    p: np.ndarray  # the plant's numbers; the place of the paths that it follows, if any, is not among them
     x0: np.ndarray
     z0: np.ndarray  # initial controller state
     table: np.ndarray  # gain schedule, a row per sample; the last row holds after the end
@@ -96,7 +97,8 @@ def run_loop(plant, law, loop, advance=None, rates="ode"):
     samples the states (N, n_x), measurements and controller states (N, n_y + n_z), outputs of the law (N, n_out) and
     inputs (N, n_u).
     """
-    ode, p, n, n_y, n_z = plant.function(rates), plant.p(), loop.samples + 1, len(loop.measured), len(loop.z0)
+    n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
+    ode, p = plant.function(rates), np.append(plant.place, loop.p)
     native = ode.native("closed", 4 * loop.samples * loop.substeps) if advance is None else None
     exact = native is not None and not n_z and loop.noise is None and loop.quantum is None  # the law gets states
     logs = {

@@ -322,15 +322,18 @@ def _side_by_side(picture, each, ax, title):
 
 def shows_mechanism(run) -> bool:
     """Whether `animate` and `stroboscope` can draw a run: it has samples, and its mechanism shapes or positions."""
-    mechanism, _ = _mechanism(run)
+    mechanism, *_ = _mechanism(run)
     return mechanism is not None and len(run.t) > 0 and bool(mechanism.shapes or _positions(mechanism))
 
 
 def _mechanism(run):
-    """The mechanism of a run or a closed loop, and the numbers of its parameters; None of a run without its model."""
+    """The mechanism of a run or a closed loop, its parameters and its paths; None of a run without its model."""
     if hasattr(run, "commands"):
-        return run.plant.mechanism, run.plant.parameters
-    return (None, ()) if run.model is None else (run.model.reduction.mechanism, run.model.parameters)
+        planned = getattr(run.plan, "model", None)
+        return run.plant.mechanism, run.plant.parameters, (planned.paths if planned else {}) | run.plant.paths
+    if run.model is None:
+        return None, (), {}
+    return run.model.reduction.mechanism, run.model.parameters, run.model.paths
 
 
 def _positions(mechanism):
@@ -353,13 +356,13 @@ def _spread(run, count):
 
 
 def _postures(run, t):
-    """The mechanism of a run, its parameters, and its coordinates (nq, N) at some instants."""
-    mechanism, p = _mechanism(run)
+    """The mechanism of a run, its coordinates (nq, N) at some instants, its parameters and its paths."""
+    mechanism, p, paths = _mechanism(run)
     if hasattr(run, "commands") or len(run.t) >= PATH_POINTS:  # straight between samples: that cannot be seen
         q = np.array([np.interp(t, *_ascending(run, name)) for name in mechanism.q.names])
     else:
         q = np.array([run.at(instant)[: mechanism.q.nq] for instant in t]).T
-    return mechanism, np.asarray(p)[: len(mechanism.parameters.names)], q
+    return mechanism, q, np.asarray(p)[: len(mechanism.parameters.names)], paths
 
 
 def _pictured(run, t, trail, fps, pace):
@@ -379,12 +382,12 @@ def _pictured(run, t, trail, fps, pace):
 
 def _shapes(run, t):
     """Shapes (d, n, N) of a run's mechanism at some instants; without shapes, dots at its positions."""
-    mechanism, p, q = _postures(run, t)
+    mechanism, *posture = _postures(run, t)
     if mechanism.shapes:
-        return moved(mechanism, t, q, p)
+        return moved(mechanism, t, *posture)
     shapes = {}
     for names in _positions(mechanism):
-        signs = [-1.0 if sign < 0 else 1.0 for sign in heights(mechanism, names, t, q, p)]
+        signs = [-1.0 if sign < 0 else 1.0 for sign in heights(mechanism, names, t, *posture)]
         rows = [sign * np.interp(t, *_ascending(run, name)) for name, sign in zip(names, signs, strict=True)]
         shapes.setdefault(", ".join(names), np.array(rows)[:, np.newaxis, :])
     largest = max((points.shape[0] for points in shapes.values()), default=0)

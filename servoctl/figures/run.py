@@ -91,7 +91,7 @@ def _height(run, names):
     if not len(run.t) or not set(names) <= set(own):
         return [0] * len(names)
     model = run.model
-    return heights(model.reduction.mechanism, names, run.t, run.jets[: model.nq], model.parameters)
+    return heights(model.reduction.mechanism, names, run.t, run.jets[: model.nq], model.parameters, model.paths)
 
 
 def _upright(run, names):

@@ -214,7 +214,7 @@ def _linear_plant(plant, t, x, u, rate, disturbed, name):
     u = np.zeros(m) if u is None else ordered(u, plant.inputs, "input")
     at_rest = [0.0] * (n_x - len(plant.lag)) + [u[plant.inputs.index(name)] for name in plant.lagged]
     x = np.where(np.isnan(x), at_rest, x)
-    p, at_u = plant.p(u), len(plant.parameters)
+    p, at_u = plant.p(u), plant.at_u
     columns = [*range(at_u, at_u + m), *places]
     A, B = jacobian(plant.function("ode"), "x", t, x, p), jacobian(plant.function("ode"), "p", t, x, p)[:, columns]
     C, D = np.eye(n_x), np.zeros((n_x, len(columns)))
@@ -274,7 +274,8 @@ def _linear_closed(closed, t, name):
             quantisation=closed.conditions.sensors.quantisation,
         )
     u, y = closed.inputs[:, k], closed.measurements[:, k]
-    now = replace(plant, parameters=closed.p[: len(plant.parameters), k])  # of which some are disturbed
+    first = plant.at_u - len(plant.parameters)
+    now = replace(plant, parameters=closed.p[first : plant.at_u, k])  # of which some are disturbed
     system = _late(_linear_plant(now, t, x, u, law.rate, disturbable_of(closed), "plant"), plant, loop.delay)
     return connected(system, _linear_law(law, t, y, closed.controller_states[:, k], "law"), closed, name)
 

@@ -143,7 +143,7 @@ class _Machine:
         q = plant.mechanism.q
         self.free, self.places, self.speeds = [], np.zeros(q.nq, int), np.zeros(q.n, int)
         self._find(q)
-        self._directions, self._inputs = plant.function("directions"), slice(len(plant.parameters), None)
+        self._directions, self._inputs = plant.function("directions"), slice(plant.at_u, None)
 
     def _find(self, q):
         """Addresses of the coordinates and velocities in MuJoCo's state."""

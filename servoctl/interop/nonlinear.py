@@ -153,7 +153,7 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
 
     def numbers(u, params):
         applied, calm = np.clip(u[:m], *low_high), np.zeros(len(plant.disturbable))
-        p = np.concatenate([_parameter_values(plant.parameters, symbols, params), applied, calm])
+        p = np.concatenate([plant.place, _parameter_values(plant.parameters, symbols, params), applied, calm])
         p[places] = u[m:]
         return p
 

@@ -14,6 +14,7 @@ from servoctl.methods.bounded import End, FreeEntries
 from servoctl.model.model import derive
 from servoctl.model.rests import RANK, Rests
 from servoctl.model.start import State
+from servoctl.plants.plant import refuse_references
 from servoctl.simulation import simulated
 from servoctl.spec.references import Jets, rates_in_time, required_paths
 from servoctl.values import frozen
@@ -47,6 +48,7 @@ class Transfer:
     """
 
     def __init__(self, plant, program, span, limits, bounds, start, end):
+        refuse_references(plant, "The transfer is")
         self.plant, self.program, self.span, self.end = plant, program, span, end
         self.limits = limits
         self.n, self.m, self.nq = plant.n_x, len(plant.inputs), plant.mechanism.q.nq

@@ -146,6 +146,17 @@ def made_again(whole, mechanism, **of_actuators):
     return again.with_references(**{name: whole.paths[name] for name in again.paths})
 
 
+def refuse_references(plant, what):
+    """Refuse a plant whose own equations contain references; `what` begins the rule: "The identification is"."""
+    if plant.paths:
+        raise SpecificationError(
+            f"The equations of the plant contain the references {', '.join(plant.paths)}.",
+            f"{what} that of a plant whose equations contain t, its states, inputs and parameters alone.",
+            do="Write formulas of q.t in the mechanism instead.",
+            references=tuple(plant.paths),
+        )
+
+
 @frozen(eq=False)
 class Plant(Value, Shown):
     """The full mechanism under actuator inputs and disturbances, material constraints held; made by `plant`.
@@ -262,12 +273,6 @@ class Plant(Value, Shown):
         fixed = np.append(self.place, self.parameters)
         fixed, d = (np.repeat(part[:, None], u.shape[1], axis=1) for part in (fixed, d))
         return np.concatenate([fixed, u, d])  # u is NaN where a motion ended
-
-    def p_of_cases(self, constants, u=None):
-        """The vectors p (n_p, N) of cases with other parameters (n_c, N) and the same inputs u (m,), default 0."""
-        p = np.repeat(self.p(u)[:, None], constants.shape[1], axis=1)
-        p[self.at_u - len(constants) : self.at_u] = constants
-        return p
 
     def disturbed(self, name):
         """The index in p of what a disturbance acts on.

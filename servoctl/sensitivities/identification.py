@@ -18,7 +18,7 @@ from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, SpecificationError
 from servoctl.markup import Shown
 from servoctl.plants.equations import equations_at
-from servoctl.plants.plant import Plant
+from servoctl.plants.plant import Plant, refuse_references
 from servoctl.run import ByName
 from servoctl.sensitivities.records import as_records
 from servoctl.tolerances import TINY
@@ -178,6 +178,7 @@ def _require_free(plant):
             do="Write the mechanism in coordinates without material constraints.",
             invariants=plant.constraint_names(),
         )
+    refuse_references(plant, "The identification is")
 
 
 def _places(plant):

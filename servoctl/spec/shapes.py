@@ -14,6 +14,7 @@ import numpy as np
 
 from servoctl.checks import as_list, column, mapping
 from servoctl.errors import SpecificationError
+from servoctl.spec.references import Jets
 from servoctl.values import Identity, evenly
 
 __all__ = ["box", "disc", "spring"]
@@ -118,9 +119,13 @@ def as_shapes(shapes, known):
     return placed
 
 
-def moved(mechanism, t, q, p):
-    """Points of the shapes by name, (d, n, N) [m], at t (N,) [s], q (nq, N) and parameters p (n_p,)."""
-    values = np.array(_points_of(Identity(mechanism))(np.reshape(t, (1, -1)), q, p))
+def moved(mechanism, t, q, p, paths):
+    """Points of the shapes by name, (d, n, N) [m], at t (N,) [s], q (nq, N), parameters p (n_p,), along paths by name.
+
+    References without a path among them follow the default ones.
+    """
+    jets = _jets_along(mechanism, mechanism.shapes.values(), paths)
+    values = np.array(_points_of(Identity(mechanism))(np.reshape(t, (1, -1)), q, p, jets.at(t)))
     ends = np.cumsum([points.numel() for points in mechanism.shapes.values()])
     rows = np.split(values, ends[:-1])
     return {
@@ -134,14 +139,19 @@ def _points_of(identity):
     mechanism = identity.value
     q, p = mechanism.q, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)
     points = ca.vertcat(*(ca.vec(points) for points in mechanism.shapes.values()))
-    return ca.Function("shapes", [q.t, ca.vertcat(*q), p], [ca.densify(points)])
+    jets = _jets_along(mechanism, mechanism.shapes.values()).symbols
+    return ca.Function("shapes", [q.t, ca.vertcat(*q), p, jets], [ca.densify(points)])
 
 
-def heights(mechanism, names, t, q, p):
+def _jets_along(mechanism, expressions, paths=None):
+    return Jets(mechanism.q, expressions, mechanism.q.family.paths | (paths or {}))
+
+
+def heights(mechanism, names, t, q, p, paths):
     """For each of some coordinates or outputs: 1 if it measures height, -1 if depth, 0 if neither is certain.
 
     At rest, the balance of a mechanism under gravity is that of a force along one of them. The instants are t (N,) with
-    q (nq, N) and p (n_p,). All are 0 if an output contains derivatives.
+    q (nq, N) and p (n_p,), along paths by name. All are 0 if an output contains derivatives.
     """
     own = dict(zip(mechanism.q.names, mechanism.q, strict=True)) | mechanism.outputs
     if any(mechanism.q.order(own[name]) > 0 for name in names):
@@ -149,13 +159,15 @@ def heights(mechanism, names, t, q, p):
     chosen = evenly(len(t), INSTANTS)
     system = mechanism.q
     rates = ca.vertcat(*system.gamma(1), *system.gamma(2))
-    symbols = [system.t, ca.vertcat(*system), rates, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)]
-    slopes = ca.jacobian(ca.vertcat(*(own[name] for name in names)), symbols[1]) @ system.V
+    slopes = ca.jacobian(ca.vertcat(*(own[name] for name in names)), ca.vertcat(*system)) @ system.V
+    jets = _jets_along(mechanism, [mechanism.balance, slopes], paths)
+    parameters = ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)
+    symbols = [system.t, ca.vertcat(*system), rates, parameters, jets.symbols]
     p = np.asarray(p)[: len(mechanism.parameters.names)]
     rest = ca.Function("rest", symbols, [ca.densify(mechanism.balance), ca.densify(slopes.T)])
-    shares = []
+    shares, r = [], jets.at(np.asarray(t))
     for i in chosen:
-        weight, directions = (np.array(value) for value in rest(t[i], q[:, i], 0.0, p))
+        weight, directions = (np.array(value) for value in rest(t[i], q[:, i], 0.0, p, r[:, i]))
         if not (np.isfinite(weight).all() and np.isfinite(directions).all()):
             return [0] * len(names)
         shares.append(np.linalg.lstsq(directions, weight[:, 0], rcond=None)[0] * np.linalg.norm(directions, axis=0))

@@ -88,7 +88,7 @@ def close_many(
     gathered = None
     if not run.plant.equations.orders:  # else each loop is judged by itself
         step = run.law.step.native("step") if run.law.allocation else None
-        placed = run.plant.p_of_cases(numbers[0])[: run.plant.at_u]
+        placed = _numbers_of(run.plant, numbers[0])[: run.plant.at_u]
         gathered = run_batch(derived, loop, (placed, *numbers[1:]), _noise(run, seeds), traced, every, threads, step)
     if gathered is None:
         gathered = _one_by_one(run, derived, loop, numbers, seeds, traced, every)
@@ -135,7 +135,7 @@ def _at_all(run, constants):
 def _resolved(run, constants, starts):
     """The loop with substeps for the case with the fastest eigenvalue."""
     plant, law, loop = run.plant, run.law, run.loop
-    require_consistent(plant, loop.t0, starts, plant.p_of_cases(constants))
+    require_consistent(plant, loop.t0, starts, _numbers_of(plant, constants))
     if run.conditions.timing.substeps is not None:
         return loop
     substeps = _most_steps(plant, law, loop, constants, starts)
@@ -144,6 +144,13 @@ def _resolved(run, constants, starts):
     transport = steps(plant, law.period, substeps, loop.t0, loop.x0, loop.initial_input)[1]
     forces = run.conditions.forces(loop.t0, law.period / substeps, loop.samples * substeps)
     return replace(loop, substeps=substeps, transport=transport, **forces)
+
+
+def _numbers_of(plant, constants, u=None):
+    """The vectors p (n_p, N) of a plant with other parameters (n_c, N) and the same inputs u (m,), default 0."""
+    p = np.repeat(plant.p(u)[:, None], constants.shape[1], axis=1)
+    p[plant.at_u - len(constants) : plant.at_u] = constants
+    return p
 
 
 def _unit(run):
@@ -221,7 +228,7 @@ def _case_numbers(run, columns, scale):
 def _most_steps(plant, law, loop, constants, starts):
     """Integration steps per sample of the case with the fastest eigenvalue at the start."""
     n_x, n = starts.shape
-    p = plant.p_of_cases(constants, loop.initial_input)
+    p = _numbers_of(plant, constants, loop.initial_input)
     both = plant.function("jacobian").grid(loop.t0, starts, p).reshape(-1, n_x, n).transpose(2, 1, 0)
     A = np.where(np.isfinite(both[:, :, :n_x]), both[:, :, :n_x], 0.0)
     case = int(np.argmax(np.abs(np.linalg.eigvals(A)).max(axis=1)))
