@@ -27,7 +27,7 @@ from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.paths import rest_to_rest
 from servoctl.spec.program import Program
-from servoctl.spec.references import followed_path, names_in, required_paths
+from servoctl.spec.references import followed_path, orders_in, required_paths
 from servoctl.values import frozen
 
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
@@ -246,7 +246,7 @@ class _Scene:
     def slower_paths(self, factor):
         """The paths of the program's references along a time that is slowed by a factor, by name."""
         m = self.mechanism
-        both = [name for name in names_in(m.q, [m.balance, m.E, *m.constraints.values()]) if name in self.paths]
+        both = [name for name in orders_in(m.q, [m.balance, m.E, *m.constraints.values()]) if name in self.paths]
         if both:
             raise SpecificationError(
                 f"The mechanism and its program both contain {', '.join(both)}.",

@@ -11,7 +11,7 @@ import numpy as np
 
 from servoctl.codegen.paths import arguments
 from servoctl.reduction.rows import Row
-from servoctl.spec.references import function_of, names_in
+from servoctl.spec.references import function_of, orders_in
 from servoctl.tolerances import ENTRY, TINY
 
 NEWTON = 25  # steps
@@ -59,7 +59,7 @@ class Rests:
             mechanism.E, *(Row(e, max(q.order(e), 0), name, "material").gradient(q).T for name, e in material.items())
         )
         rows, balance = {**material, **program.residuals}, mechanism.balance - forces
-        return cls(mechanism, balance, B, rows, names_in(q, [balance, B, *rows.values()]))
+        return cls(mechanism, balance, B, rows, tuple(orders_in(q, [balance, B, *rows.values()])))
 
     def measured(self, t, z, p):
         """The rows (e,) at [q; μ], their slopes (e, z) and the rows relative to these and to the state."""

@@ -9,7 +9,7 @@ from servoctl.jets.branches import as_text, without_turns
 from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import Packed
-from servoctl.spec.references import names_in
+from servoctl.spec.references import orders_in
 
 REALISATIONS = ("ideal", "actuators")
 
@@ -135,7 +135,7 @@ class Program(Packed):
     def references(self, q):
         """Names of the references that residuals, weights and wishes contain, in the order in which they were made."""
         parts = self.with_turns, self.weights, self.toward
-        return names_in(q, [ca.SX(value) for part in parts for value in part.values()])
+        return tuple(orders_in(q, [ca.SX(value) for part in parts for value in part.values()]))
 
     def slower(self, q, sigma, instant):
         """The program of `slowed`, whose references follow paths that are slowed alike."""
