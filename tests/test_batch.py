@@ -127,7 +127,7 @@ LAWS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", ["computed", "estimating"])
 def test_laws_of_the_toolkit(plan, name):
     plant = sv.plant(CRANE)
     law = LAWS[name](plan, plant)
