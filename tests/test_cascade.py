@@ -207,7 +207,9 @@ def moved(model, method=None, drift=None):
     return sv.simulate(model, model.start(), SHORT, method, drift=drift, t_eval=np.linspace(*SHORT, 6))
 
 
-@pytest.mark.parametrize("name", ["discs", "velocities by place", "velocities between cars", "distances", "crane behind a car"])
+@pytest.mark.parametrize(
+    "name", ["discs", "velocities by place", "velocities between cars", "distances", "crane behind a car"]
+)
 def test_rows_and_motions_are_those_of_one_expression_for_each_row(name, pairs):
     by_blocks, by_expressions = pairs(name)
     assert by_blocks.reduction.cascade is not None and by_expressions.reduction.cascade is None

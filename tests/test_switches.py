@@ -152,7 +152,8 @@ VARIANTS = {  # force(t, y, dy) with CasADi, the same on one side, the switch, s
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    [*((name, "Taylor") for name in VARIANTS), *(("an edge that moves", method) for method in ("DOP853", "RadauIIA", "RK8", "Radau"))],
+    [*((name, "Taylor") for name in VARIANTS),
+     *(("an edge that moves", method) for method in ("DOP853", "RadauIIA", "RK8", "Radau"))],
 )
 def test_other_switches_agree_with_events(name, method):
     force, rates, switch, (y0, dy0, side, end) = VARIANTS[name]
@@ -511,7 +512,8 @@ STEEP = {  # of k (t - 1): as the designer writes them, where exp leaves the ran
 
 @pytest.mark.parametrize(
     ("name", "method", "slope"),
-    [*((name, "Taylor", 1e5) for name in STEEP), *((name, "DOP853", 2e3) for name in STEEP), ("logistic", "Taylor", 500.0)],
+    [*((name, "Taylor", 1e5) for name in STEEP), *((name, "DOP853", 2e3) for name in STEEP),
+     ("logistic", "Taylor", 500.0)],
 )
 def test_steep_blends_neither_overflow_nor_are_stepped_over(name, method, slope):
     """y'' = f - y from y = 0.3 at rest: y(2) = 0.3 cos 2 + the integral of f(s) sin(2 - s)."""

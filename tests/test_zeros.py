@@ -272,7 +272,10 @@ def scene(name):
     return model, span, start, moved(f, span, start)
 
 
-ALIVE = ("fmax in time", "tanh in time", "cam with dwell", "fabs in place", "logistic in place", "bump in place", "root in place")
+ALIVE = (
+    "fmax in time", "tanh in time", "cam with dwell", "fabs in place", "logistic in place", "bump in place",
+    "root in place",
+)  # fmt: skip
 
 
 @pytest.mark.usefixtures("uncompiled")

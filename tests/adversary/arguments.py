@@ -35,8 +35,9 @@ ODD = {
     "uneven": [[1, 2], [3]], "MX": ca.MX.sym("x"), "SX": ca.SX.sym("zz"),
     "function": lambda *_: 1, "{'x': 1e300}": {"x": 1e300}, "{'zz': 1}": {"zz": 1.0}, "{None: 1}": {None: 1.0},
 }  # fmt: skip
-SLOW = ("relaxed", "fastest", "tradeoff", "figures.", "map.plot", "computed", "minimum_phase")  # how the names of calls begin that solve
-FEW = ("None", "text", "1e-300", "NaN", "1j", "(2, 3) array", "uneven", "SX", "function", "{'zz': 1}")  # for them
+# how the names of calls begin that solve for long, and the odd values for them
+SLOW = ("relaxed", "fastest", "tradeoff", "figures.", "map.plot", "computed", "minimum_phase")
+FEW = ("None", "text", "1e-300", "NaN", "1j", "(2, 3) array", "uneven", "SX", "function", "{'zz': 1}")
 
 
 def point():
