@@ -13,7 +13,7 @@ CERTIFIED = (  # scenes that every method and treatment of drift is tested on; t
     "appell-hamel-squared", "constant-speed-horizontal",
 )  # fmt: skip
 
-KINDS = (  # flat, redundant coordinates, internal dynamics, unstable ones, ideal, rolling, order 3, quasi-velocities, an end
+KINDS = (  # flat, redundant, internal dynamics, unstable ones, ideal, rolling, order 3, quasi-velocities, an end
     "overhead-crane", "crane-3d-redundant", "mass-on-car", "vtol-centre", "two-cars-ideal", "appell-hamel", "spiral",
     "wheeled-robot", "appell-hamel-squared",
 )  # fmt: skip

@@ -120,8 +120,6 @@ def test_without_a_compiler_the_loops_are_closed_one_by_one(plan, cases, monkeyp
 
 
 LAWS = {
-    "feedforward": lambda plan, plant: sv.feedforward(plan, plant, rate=100.0),
-    "pd": lambda plan, plant: sv.pd(plan, plant, 100.0, {"trolley": 90.0, "hoist": 200.0}, {"trolley": 90.0, "hoist": 90.0}),
     "computed": lambda plan, plant: sv.computed(plan, plant, rate=100.0),
     "estimating": lambda plan, plant: sv.output_feedback(sv.lqr(plan, plant, 100.0), plant, {"x": 1e-3, "l": 1e-3, "theta": 1e-3}),
 }  # fmt: skip

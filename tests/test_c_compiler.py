@@ -112,7 +112,8 @@ def test_a_call_has_the_same_bits_whatever_was_called_before(fresh, monkeypatch)
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    [("overhead-crane", None), ("appell-hamel", "RK4"), ("pendubot", "Taylor"), ("appell-hamel", "RadauIIA"), ("pendubot", "DOP853")],
+    [("overhead-crane", None), ("appell-hamel", "RK4"), ("appell-hamel", "RadauIIA"), ("pendubot", "Taylor"),
+     ("pendubot", "DOP853")],
 )
 def test_a_repeated_simulation_has_the_same_bits(fresh, name, method):
     scene, model = gallery[name], sv.derive(*gallery[name].build())

@@ -70,6 +70,7 @@ FORCES = {
 }
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("kind", FORCES)
 def test_inputs_are_numbers_expressions_paths_or_functions(machine, kind):
     make, force = FORCES[kind]
@@ -103,6 +104,7 @@ def test_a_plant_that_falls_has_no_internal_dynamics(machine, method):
     assert sv.verify(run).passed
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("part", ["a force", "an input", "states", "parameters"])
 def test_wrong_runs_of_a_plant_do_not_pass(machine, part):
     t = machine.mechanism.q.t

@@ -183,7 +183,7 @@ def the_table_of_other_machines_is_what_the_example_says(result):
             assert cell == f"{result[f'{name}: {what}']:.{digits}f}"
 
 
-# every example ---------------------------------------------------------------------------------------------------------
+# every example -------------------------------------------------------------------------------------------------------
 
 CHECKS = {  # of what an example returns; it has a check of its name, or these
     "closed_loop_crane": (
@@ -203,7 +203,8 @@ CHECKS = {  # of what an example returns; it has a check of its name, or these
 
 def in_the_page():
     """{example: ((name of a number, number as text), ...)} of docs/examples.md."""
-    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", (DOCS / "examples.md").read_text(encoding="utf-8"), re.M)
+    page = (DOCS / "examples.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \[(\w+)\]\(.*?\) \| [^|]+ \| (.*) \|$", page, re.M)
     return {name: re.findall(r"`([^`]+)` (-?[\d.]*\d)", cell) for name, cell in rows}
 
 

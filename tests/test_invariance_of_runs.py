@@ -174,7 +174,8 @@ SIZES = {"crane": 3, "appell_hamel": 5, "mass_on_car": 2, "spiral": 2}
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [*((name, "all at once") for name in SYSTEMS), ("crane", "kilometres"), ("appell_hamel", "permuted"), ("spiral", "quasi-velocities")],
+    [*((name, "all at once") for name in SYSTEMS), ("crane", "kilometres"), ("appell_hamel", "permuted"),
+     ("spiral", "quasi-velocities")],
 )
 def test_same_motion_and_report_in_other_words(name, kind):
     w = Words(**WORDS[kind] | ({"order": tuple(reversed(range(SIZES[name])))} if "order" in WORDS[kind] else {}))
@@ -211,7 +212,8 @@ EQUIVALENT = {"times 1e6": scaled(1e6), "times 1e-6": scaled(1e-6), "mixed": mix
 
 
 @pytest.mark.parametrize(
-    ("name", "how"), [("crane", "sums"), ("appell_hamel", "mixed"), ("mass_on_car", "times 1e6"), ("spiral", "times 1e-6")]
+    ("name", "how"),
+    [("crane", "sums"), ("appell_hamel", "mixed"), ("mass_on_car", "times 1e6"), ("spiral", "times 1e-6")],
 )
 def test_equivalent_constraints_give_the_same_motion_and_report(name, how):
     system = SYSTEMS[name](Words(residuals=EQUIVALENT[how]))

@@ -222,6 +222,7 @@ def test_sizes_make_errors_absolute():
     assert np.all(held["error"] < 1e-12), "the program holds the load in every model"
 
 
+@pytest.mark.usefixtures("uncompiled")
 def test_models_start_alike():
     """What the start of the reference holds is held where it exists; the rest is as near as possible to it."""
     model = PENDULA["friction"]()

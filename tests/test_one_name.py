@@ -99,7 +99,7 @@ def test_the_finding(names):
     assert f"{name}_residual" in str(model) and "other_residual" not in str(model)
 
 
-BOUNDS = [("x", 0.7), ("dx", 0.5), ("x_output", 0.8)]
+BOUNDS = [("dx", 0.5), ("x_output", 0.8)]
 
 
 @pytest.mark.parametrize(("name", "most"), BOUNDS)

@@ -282,6 +282,7 @@ def steered(base=1.1):
     return sv.Mechanism(q, gibbs=gibbs, actuators={"F": (1, 0), "T": (0, 1)})
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("scale", "factor", "by"),
     [(1.0, 1.0, "ideal"), (1e-3, -3.0, "actuators")],

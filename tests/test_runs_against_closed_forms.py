@@ -182,10 +182,9 @@ def test_cranes_are_flat_and_follow_their_closed_form(name, coordinates, crane_r
         assert relative(run[signal], reference[signal]) < 1e-8
 
 
-@pytest.mark.parametrize("coordinates", ["", "-redundant"])
-@pytest.mark.parametrize("name", CRANES)
-def test_the_report_tells_that_cranes_are_flat(name, coordinates, gallery_model):
-    model = gallery_model(name + coordinates)
+@pytest.mark.parametrize("name", ["overhead-crane", "winch-crane-redundant"])
+def test_the_report_tells_that_cranes_are_flat(name, gallery_model):
+    model = gallery_model(name)
     report = repr(model)
     assert "flat: the program determines the whole motion" in report and "hidden constraint" in report
     assert "index 5" in repr(model.structure())

@@ -1,4 +1,4 @@
-"""The gallery in docs: its pages have the code, the facts and what is printed of each scene, its number and its pictures."""
+"""The gallery in docs: its pages have the code, the facts, the number and what is printed of each scene; pictures."""
 
 import re
 import runpy

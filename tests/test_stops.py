@@ -171,6 +171,7 @@ SINGULAR = ("appell-hamel-squared", "constant-speed-horizontal")
         *(("mass-on-car", method) for method in ("RK45", "Radau", "LSODA", "RK4")),
     ],
 )
+@pytest.mark.usefixtures("uncompiled")
 def test_no_false_alarm(name, method, gallery_model):
     model, scene = gallery_model(name), gallery[name]
     start = model.start(**scene.start, guess=scene.guess)

@@ -220,6 +220,7 @@ LOST = {  # the model, degrees in motion and at the start, a jet that is zero th
 }
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("name", LOST)
 def test_a_relative_degree_that_is_lost_at_the_start_is_told_with_that_of_the_motion(name):
     build, moving, resting, zero = LOST[name]

@@ -167,6 +167,7 @@ def appell_hamel():
     return model, model.start(x=0.0, y=0.0, phi=0.0, theta=0.3, dphi=1.0, dtheta=0.5)
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("scene", [trailer, sled, driven, bead])
 def test_rates_that_rows_determine_satisfy_them_to_rounding(scene, rtol=1e-7):
     model, start = scene()

@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
+from scenes import POINT, POINT_PROGRAM
 from scipy.optimize import brentq
 
 import servoctl as sv
@@ -46,11 +47,11 @@ def test_slowed_rates_and_curvatures_leave_the_path_where_it_is():
 def test_the_motions_tried_are_shown(capsys, monkeypatch):
     monkeypatch.setattr("servoctl.progress.PATIENCE", 0)
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0))
+    sv.fastest(POINT, POINT_PROGRAM, {"force": 20.0}, (0.0, 1.0))
     printed = capsys.readouterr().err
     assert "fastest" in printed and "motions" in printed and "simulate" not in printed
     monkeypatch.setattr("sys.stderr.isatty", lambda: False, raising=False)
-    sv.fastest(*cars(), {"force": 200.0}, (0.0, 2.0))
+    sv.fastest(POINT, POINT_PROGRAM, {"force": 20.0}, (0.0, 1.0))
     assert not capsys.readouterr().err
 
 

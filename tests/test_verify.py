@@ -209,6 +209,7 @@ def test_pivots_that_vanish_between_samples_are_replaced(samples):
     assert sv.verify(run).passed
 
 
+@pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(("order", "by"), [(2, "ideal"), (3, "actuators"), (4, "ideal")])
 def test_a_row_above_the_order_of_the_motion_has_a_residual(order, by):
     q = sv.coordinates("x y z")

@@ -28,15 +28,16 @@ WORDS = ("accepted", "refused")
 MOST_CALLS = 20_000_000  # of functions, within a call before it counts as hanging
 
 ODD = {
-    "None": None, "text": "abc", "a number in text": "1.0", "NUL": "a\0b", "a surrogate": "\ud800", "bytes": b"x",
-    "[]": [], "0": 0, "-1": -1, "2**63": 2**63, "10**400": 10**400, "1e-300": 1e-300, "1e300": 1e300, "NaN": math.nan,
+    "None": None, "text": "abc", "a number in text": "1.0", "bytes": b"x",
+    "[]": [], "0": 0, "-1": -1, "2**63": 2**63, "1e-300": 1e-300, "1e300": 1e300, "NaN": math.nan,
     "inf": math.inf, "1j": 1j, "True": True, "complex64": np.complex64(2 + 3j), "longdouble": np.longdouble(0.1),
     "(2, 3) array": np.ones((2, 3)), "array of text": np.array(["a"]), "complex array": np.array([1j, 2.0]),
-    "uneven": [[1, 2], [3]], "['a']": ["a"], "{1}": {1}, "MX": ca.MX.sym("x"), "SX": ca.SX.sym("zz"), "DM": ca.DM([1, 2]),
-    "function": lambda *_: 1, "type": int, "{'x': 1e300}": {"x": 1e300}, "{'zz': 1}": {"zz": 1.0}, "{None: 1}": {None: 1.0},
+    "uneven": [[1, 2], [3]], "MX": ca.MX.sym("x"), "SX": ca.SX.sym("zz"),
+    "function": lambda *_: 1, "{'x': 1e300}": {"x": 1e300}, "{'zz': 1}": {"zz": 1.0}, "{None: 1}": {None: 1.0},
 }  # fmt: skip
-SLOW = ("relaxed", "fastest", "tradeoff", "figures.", "map.plot", "computed", "minimum_phase")  # how the names of calls begin that solve
-FEW = ("None", "text", "1e-300", "NaN", "1j", "(2, 3) array", "['a']", "SX", "function", "{'zz': 1}")  # for them
+# how the names of calls begin that solve for long, and the odd values for them
+SLOW = ("relaxed", "fastest", "tradeoff", "figures.", "map.plot", "computed", "minimum_phase")
+FEW = ("None", "text", "1e-300", "NaN", "1j", "(2, 3) array", "uneven", "SX", "function", "{'zz': 1}")
 
 
 def point():

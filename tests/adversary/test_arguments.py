@@ -7,7 +7,7 @@ def test_arguments_are_accepted_or_refused_in_words(tmp_path, monkeypatch):
     """And what a designer mistypes does not pass for a number."""
     monkeypatch.chdir(tmp_path)
     outcomes = fuzz()
-    assert len(outcomes) > 9_000
+    assert len(outcomes) > 7_000
     assert leaks(outcomes) == {}
     of_numbers = {  # arguments that take numbers and neither texts nor truth values
         "plant": ("m", "delay"), "plant limit": ("limit",), "lqr": ("rate", "Q", "R"), "close_many case": ("m",),
