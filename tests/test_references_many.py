@@ -1,5 +1,7 @@
 """Many motions along references: with parameters of each case they are those of one motion after the other."""
 
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import referred
@@ -41,7 +43,6 @@ def test_integrated_motions_are_those_of_simulate():
 
 def test_starts_by_name_and_other_workers(model):
     """A worker has the paths, and places in memory of its own."""
-    from concurrent.futures import ProcessPoolExecutor
 
     cart = referred.cart()
     cases = {"theta": np.array([0.1, 0.2, 0.3]), "dtheta": np.zeros(3)}
@@ -82,7 +83,6 @@ def test_a_path_for_each_case_is_that_of_simulate_at_once(model, monkeypatch):
 
 def test_paths_of_integrated_motions_of_workers_and_in_pickles():
     import pickle
-    from concurrent.futures import ProcessPoolExecutor
 
     cart, paths = referred.cart(), [sv.paths.rest_to_rest(0.0, end, 0.4) for end in (0.5, 1.0)]
     arguments = cart, {"theta": [0.1, 0.2], "dtheta": [0.0, 0.0]}, None, (0.0, 0.4), "RK4"
@@ -105,3 +105,11 @@ def test_what_paths_cannot_be(model):
         sv.simulate_many(model, start, None, (0.0, 6.0), paths={"X": paths[0]})
     with refused(SpecificationError, "2, 3"):
         sv.simulate_many(model, start, {"m_l": [90.0, 100.0]}, (0.0, 6.0), paths={"X": paths})
+
+
+def test_a_part_without_a_case_for_compiled_code(model):
+    start, masses = model.start(guess={"l": 4.0}), [-1.0, 90.0, 110.0]
+    with ThreadPoolExecutor(2) as pool:
+        found = sv.simulate_many(model, start, {"m_l": masses}, (0.0, 6.0), paths={"X": detours(3)}, executor=pool)
+    assert np.isfinite(found["final x"]).tolist() == [False, True, True]
+    assert "m_l" in found.study["message"][0]

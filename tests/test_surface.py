@@ -34,7 +34,7 @@ WITHOUT_CASADI = ("study", "figures", "interop", "shell")
 SWEEPS = ("concurrent.futures", "multiprocessing", "importlib.metadata")
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "pandas", "dask")
 MOST_IN_A_FUNCTION, MOST_PARAMETERS, MOST_MODULES_OF_A_NAME, MOST_IN_A_REPR = 40, 8, 2, 8
-SHEETS = ("Mechanism.__init__", "simulate")  # filled in by keyword
+SHEETS = ("Mechanism.__init__", "simulate", "simulate_many")  # filled in by keyword
 
 
 def relative(path):

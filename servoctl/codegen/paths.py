@@ -33,13 +33,18 @@ class Followed:
             arrays = [np.ascontiguousarray(part) for part in (path.breaks, path.coefficients)]
             self._arrays += arrays  # which must live as long
             row[:] = pieces, size, size, *rules, *(array.ctypes.data for array in arrays)
-        self.address = float(self._table.ctypes.data)
+        self.address, self._last = float(self._table.ctypes.data), (None, None)
         _alive[self.address] = self
 
     def jets(self, t, order, instant=None):
         """Derivatives 0 .. `order` at times (N,), of the pieces that instants (N,) select: ((order + 1) n, N)."""
-        rows = [path.jets(t, order, instant)[:, 0] for path in self.paths]
-        return np.stack(rows, axis=1).reshape(-1, len(t))
+        key = (order, *np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
+        last, jets = self._last
+        if key is None or key != last:  # iterations ask for one instant again and again
+            rows = [path.jets(t, order, instant)[:, 0] for path in self.paths]
+            jets = np.stack(rows, axis=1).reshape(-1, len(t))
+            self._last = (key, jets) if key else self._last
+        return jets
 
 
 def followed(address):
@@ -60,12 +65,14 @@ def jets_in(f):
 
 def jets_at(f, t, p):
     """The jets (numbers, N) that a function takes at times (N,) with parameters p (n_p,) or (n_p, N)."""
-    p = np.broadcast_to(np.reshape(p, (len(p), -1)), (len(p), len(t)))
-    instants = p[-1] if f.name_in(3) == BY_INSTANT else t
+    p, order = np.reshape(p, (len(p), -1)), f.size2_in(3) - 1
+    instants = np.broadcast_to(p[-1], len(t)) if f.name_in(3) == BY_INSTANT else t
+    if p.shape[1] == 1:
+        return followed(p[0, 0]).jets(t, order, instants)
     jets = np.empty((jets_in(f), len(t)))
     for address in np.unique(p[0]):
         some = p[0] == address
-        jets[:, some] = followed(address).jets(t[some], f.size2_in(3) - 1, instants[some])
+        jets[:, some] = followed(address).jets(t[some], order, instants[some])
     return jets
 
 

@@ -20,7 +20,7 @@ from servoctl.control.reference import Reference, of_plan, require_plant
 from servoctl.control.residuals import Residuals, in_symbols_of, paths_along, program_residuals
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
-from servoctl.control.time_law import fastest
+from servoctl.control.time_law import fastest_along
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.jets.branches import cse
 from servoctl.markup import Shown
@@ -550,7 +550,8 @@ def limit_report(run: Closed, scene: Mapping[str, Any] | None = None) -> LimitRe
         model = run.plan.model
         mechanism, program = model.reduction.mechanism, model.reduction.program
         paths = {name: model.paths[name] for name in program.references(mechanism.q)}
-        slower = fastest(mechanism, program, allocation.plant.limits, **scene, paths=paths).factor
+        options = *(scene.get(name) for name in ("start", "guess", "parameters")), False
+        slower = fastest_along(paths, mechanism, program, allocation.plant.limits, scene["t_span"], options).factor
     return LimitReport(_slacks(run, allocation), {name: s for name, s in met.items() if s}, overload, slower)
 
 

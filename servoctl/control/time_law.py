@@ -83,7 +83,6 @@ def fastest(
     guess: Mapping[str, float] | None = None,
     parameters: Mapping[str, float] | None = None,
     shape: bool = False,
-    paths: Mapping[str, Any] | None = None,
 ) -> TimeLaw:
     """The fastest time law along the path of a program under which signals keep their limits.
 
@@ -111,8 +110,6 @@ def fastest(
         Parameters of the mechanism that differ from their defaults.
     shape : bool, optional
         Whether the law along the path is free; default: only its duration is.
-    paths : dict of str to Path, optional
-        Those of the program's references by name; default: those with which they were made.
 
     Returns
     -------
@@ -130,8 +127,17 @@ def fastest(
     IntegrationStopped
         If the optimisation with `shape=True` finds no minimum.
     NameUnknown
-        For a limit of an unknown signal, or the path of an unknown reference.
+        For a limit of an unknown signal.
     """
+    return fastest_along(None, mechanism, program, limits, t_span, (start, guess, parameters, shape))
+
+
+def fastest_along(paths, mechanism, program, limits, t_span, options):
+    """The same along paths of the program's references by name; None for those with which they were made.
+
+    The options are start, guess, parameters and shape.
+    """
+    start, guess, parameters, shape = options
     require_kind(Mechanism, "mechanism", mechanism, "sv.Mechanism(q, gibbs, ...)")
     require_kind(Program, "program", program, "sv.Program({...})")
     limits = mapping(limits, "The limits")

@@ -214,7 +214,7 @@ def _of_model(model, start, argument, real):
     functions = {"actuation": control.expression, "residuals": residual.expression}
     functions |= {"outputs": output.expression} if outputs else {}
     flat = model.flat and model.reduction.top == 2
-    functions |= {"path": model.function("path").expression} if flat else {"rates": _rates(model)}
+    functions |= {"path": model.function("path").expression} if flat else {"rates": _rates_of_state(model)}
     references = references_of(model, functions, argument, real)
     first = TIME, *references.arguments
     at = (*first, z.input(), p.input())
@@ -241,7 +241,7 @@ def _of_model(model, start, argument, real):
     )
 
 
-def _rates(model):
+def _rates_of_state(model):
     """The rates of a model's state, without the other outputs of its differential equation."""
     f = model.function("ode").expression
     arguments = f.sx_in()

@@ -17,7 +17,7 @@ from servoctl.model.jets import jet_names_to
 from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
 from servoctl.model.variants import derived_near, reordered_at, strong_near
 from servoctl.spec.mechanism import require_known
-from servoctl.spec.references import function_of
+from servoctl.spec.references import function_of, names_in
 from servoctl.values import Value, frozen
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
@@ -250,7 +250,8 @@ def _rests(model, equations, aim, held, conditions):
     """The equations, and the rest nearest to the guess before others, where a path begins at rest; else None."""
     t, q, residuals = equations.t, model.reduction.mechanism.q, model.reduction.program.residuals.values()
     rates = held.keys() - set(q.names)
-    if not any(ca.depends_on(e, q.t) for e in residuals) or any(held[name] for name in rates):
+    moves = names_in(q, residuals) or any(ca.depends_on(e, q.t) for e in residuals)
+    if not moves or any(held[name] for name in rates):
         return None
     chosen = zip(q.names, aim.reference, aim.guessed | ~aim.movable, strict=False)
     guess = {name: value for name, value, known in chosen if known}
@@ -277,11 +278,11 @@ def _stays(model, t, x):
     def largest(at, rate):
         names, f = model.signals("residuals")[0], model.signals("residuals", rate)[1].expression
         still = np.append(x[:n_x], np.zeros(f.numel_in(1) - n_x))
-        values, given = np.abs(f(at, still, p).full()).ravel(), [level == 0 for _, level in names]
+        values, given = np.abs(evaluated(f, at, still, p)), [level == 0 for _, level in names]
         return values[given if rate else slice(None)].max(initial=0.0)
 
     def stays(at):
-        moving = np.abs(rates(at, x[:n_x], p).full()[:n_x, 0])
+        moving = np.abs(evaluated(rates, at, x[:n_x], p)[:n_x])
         there = np.all(moving <= slow) if np.isfinite(moving).all() else largest(at, 0) <= slow.max()
         return bool(there and largest(at, 1) <= slow.max())
 

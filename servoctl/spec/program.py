@@ -133,12 +133,36 @@ class Program(Packed):
         return self.slower(q, sigma, instant)
 
     def references(self, q):
-        """Names of the references that residuals, weights and wishes contain, in the order in which they were made."""
+        """Names of the references that residuals, weights and wishes contain, in the order in which they were made.
+
+        Parameters
+        ----------
+        q : Coordinates
+            Those of the mechanism.
+
+        Returns
+        -------
+        tuple of str
+        """
         parts = self.with_turns, self.weights, self.toward
         return tuple(orders_in(q, [ca.SX(value) for part in parts for value in part.values()]))
 
     def slower(self, q, sigma, instant):
-        """The program of `slowed`, whose references follow paths that are slowed alike."""
+        """The program of `slowed`, whose references follow paths that are slowed alike.
+
+        Parameters
+        ----------
+        q : Coordinates
+            Those of the mechanism.
+        sigma : float
+            σ > 0.
+        instant : float
+            The fixed instant [s].
+
+        Returns
+        -------
+        Program
+        """
         if not q.plain and (not q.h.is_zero() or ca.depends_on(q.V, q.t)):
             raise SpecificationError(
                 "The kinematics q' = V w + h depend on time or drift by h.",

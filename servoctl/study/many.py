@@ -191,8 +191,8 @@ class _Many:
 
     def numbers(self, which, p):
         """Parameters p (N, n_p) of some cases as functions have them: after the places of the paths."""
-        places = [model.p[: len(model.p) - p.shape[1]] for model in self.along(which)]
-        return np.hstack([np.array(places).reshape(len(p), -1), p])
+        size = 1 if self.model.paths else 0
+        return np.hstack([np.reshape([model.p[:size] for model in self.along(which)], (len(p), size)), p])
 
     def start(self, i, model, t):
         """The start of a case."""

@@ -61,8 +61,9 @@ class Signals(ByName, Mapping):
         """A function of the jets, or the highest of these, (n, K, N) for some motions."""
         model, count = self._model, len(part)
         t, numbers = np.repeat(self._t, count), self._parameters[:, part]
-        places = [self._models[i].p[: len(model.p) - len(numbers)] for i in part]
-        p = np.tile(np.vstack([np.array(places).reshape(count, -1).T, numbers]), len(self._t))
+        size = 1 if model.paths else 0
+        places = np.reshape([self._models[i].p[:size] for i in part], (count, size))
+        p = np.tile(np.vstack([places.T, numbers]), len(self._t))
         jets = with_highest(model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
         y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
         return y.reshape(len(y), len(self._t), count)
