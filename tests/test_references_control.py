@@ -177,6 +177,16 @@ def test_a_moving_support_and_other_paths(supported):
     assert np.allclose(other.near(0.5, x).rates(0.5, x, [1.0]), other.rates(0.5, x, [1.0]), rtol=1e-12, atol=1e-12)
 
 
+def test_blocks_that_are_not_full(supported):
+    """CasADi evaluates 128 points at once; parameters of points beyond the last one have a place of paths, too."""
+    plant, run = sv.plant(supported.mechanism), supported.run
+    f, x = plant.function("accelerations"), run.jets[: plant.n_x]
+    for n in (256, 100):
+        t, p = run.t[:n], plant.p(run["drive"][None, :n])
+        expected = [f(t[k], x[:, k], p[:, k]) for k in range(n)]
+        assert np.abs(f.grid(t, x[:, :n], p) - np.transpose(expected)).max() < 1e-12
+
+
 def test_a_loop_keeps_no_place_in_memory(supported):
     plant = sv.plant(supported.mechanism)
     closed = sv.close(plant, sv.lqr(supported.run, plant), supported.first, (0.0, 0.5))

@@ -146,7 +146,7 @@ class Interpreter:
             blocks = 0
         if blocks:
             parts, run = self._blocks.parts
-            parts[2][:] = 0.0 if p.ndim == 2 else p[:, None]
+            parts[2][:] = p[:, :1] if p.ndim == 2 else p[:, None]  # also where a block is not full: paths have a place
         for k in range(0, blocks, BLOCK):
             here, size = slice(k, k + BLOCK), min(BLOCK, t.size - k)
             parts[0][0, :size], parts[1][:, :size] = t[here], x[:, here]

@@ -162,8 +162,9 @@ class Jets:
 
     def at(self, t):
         """Their values at times (N,) [s], (n, N); a path that says nothing of an instant is held there."""
-        rows = [self._paths[name].held().jets(t, k)[k] for name, k in self.places]
-        return np.concatenate([np.zeros((0, len(t))), *rows])
+        highest = {name: k for k, name in sorted((k, name) for name, k in self.places)}
+        jets = {name: self._paths[name].held().jets(t, k) for name, k in highest.items()}
+        return np.concatenate([np.zeros((0, len(t))), *(jets[name][k] for name, k in self.places)])
 
 
 def required_paths(paths):

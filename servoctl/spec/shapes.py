@@ -119,7 +119,7 @@ def as_shapes(shapes, known):
     return placed
 
 
-def moved(mechanism, t, q, p, paths):
+def moved(mechanism, t, q, p, paths=None):
     """Points of the shapes by name, (d, n, N) [m], at t (N,) [s], q (nq, N), parameters p (n_p,), along paths by name.
 
     References without a path among them follow the default ones.
@@ -147,7 +147,7 @@ def _jets_along(mechanism, expressions, paths=None):
     return Jets(mechanism.q, expressions, mechanism.q.family.paths | (paths or {}))
 
 
-def heights(mechanism, names, t, q, p, paths):
+def heights(mechanism, names, t, q, p, paths=None):
     """For each of some coordinates or outputs: 1 if it measures height, -1 if depth, 0 if neither is certain.
 
     At rest, the balance of a mechanism under gravity is that of a force along one of them. The instants are t (N,) with
