@@ -68,7 +68,7 @@ def unit(plant, law, disturbed, residuals=None):
 def _derived(plant, law, disturbed, residuals):
     """Rates, law and residuals in C; parts that depend on the case alone, or on the sample alone, are split off."""
     n_c, n_u, project = plant.at_u, len(plant.inputs), plant.equations.project()
-    t, x, p, followed, rates = _rates(plant, disturbed)
+    t, x, p, followed, rates = _plant_rates(plant, disturbed)
     constants, applied = p[:n_c], ca.vertcat(p[n_c : n_c + n_u], *(p[i] for i in disturbed))
     still = ca.vertcat(ca.SX(0, 1), *(p[i] for i in range(n_c) if i not in disturbed))
     place = ca.vertcat(ca.SX(0, 1), *p.elements()[: n_c - len(plant.parameters)])
@@ -126,7 +126,7 @@ def _law_in_c(law):
     return t_k, row, _lanes("law", t_k, y, common, command, emit.LANES_COMMON), values
 
 
-def _rates(plant, disturbed):
+def _plant_rates(plant, disturbed):
     """Symbols t, x, p and r of a plant, and x' with no generalised force but those that are disturbed."""
     f = plant.function("ode").expression
     t, x, p, *r = f.sx_in()

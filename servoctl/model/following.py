@@ -18,8 +18,9 @@ def breaks_within(model, span, smoother=np.inf):
 
     That are `smoother` more than the actuation contains. SpecificationError where it has fewer than these.
     """
-    low, high = min(span), max(span)
-    found = [np.zeros(0)]
+    if not model.paths:
+        return np.zeros(0)
+    low, high, found = min(span), max(span), []
     for name, path in model.paths.items():
         needs = model.reduction.follows[name]
         require_class(name, path, needs, (low, high), model.reduction.program.jumps)
