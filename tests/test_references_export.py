@@ -121,3 +121,21 @@ def test_what_cannot_be_exported_is_refused(model, tmp_path):
     plain = sv.derive(mechanism, sv.Program({"X": X, "Z": Z + 4.0}, by="actuators"))
     with refused(SpecificationError, "references"):
         export_c(plain, tmp_path, references="argument")
+
+
+@pytest.mark.parametrize("form", ["table", "argument"])
+def test_a_mass_without_parameters_under_a_force_with_a_reference_of_its_own(form, tmp_path):
+    """x = r under a wind w: the force is 2 r'' - w."""
+    q = sv.coordinates("x")
+    r = q.references(r=sv.paths.rest_to_rest(0.0, 3.0, 2.0), w=sv.paths.polynomials([0.0, 2.0], [[0.5], [1.0]]))
+    mechanism = sv.Mechanism(q, sv.particle(q, 2.0, [q[0], 0]), 0, {"force": q[0]}, forces={"x": r.w})
+    model = sv.derive(mechanism, sv.Program({"X": q[0] - r.r}, by="actuators"))
+    plan = Exported(export_c(model, tmp_path, name="plan", references=form), "plan")
+    x, z, u, t = np.zeros(2), np.empty(3), np.empty(1), 0.7
+    (place, _, second), wind = model.paths["r"].jets([t], 2)[:, 0, 0], model.paths["w"](t)
+    first = [
+        t,
+        *([np.array([place, wind, *model.paths["r"].jets([t], 1)[1, 0], 0.5, second, 0.0])] * (form == "argument")),
+    ]
+    assert plan("feedforward", *first, x, np.zeros(1), z, u) >= 0
+    assert close(u, 2.0 * second - wind) and close(x[0], place)

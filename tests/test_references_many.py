@@ -84,7 +84,7 @@ def test_a_path_for_each_case_is_that_of_simulate_at_once(model, monkeypatch):
 def test_paths_of_integrated_motions_of_workers_and_in_pickles():
     import pickle
 
-    cart, paths = referred.cart(), [sv.paths.rest_to_rest(0.0, end, 0.4) for end in (0.5, 1.0)]
+    cart, paths = referred.cart(), [sv.paths.rest_to_rest(0.0, end, 1.5) for end in (0.5, 1.0)]
     arguments = cart, {"theta": [0.1, 0.2], "dtheta": [0.0, 0.0]}, None, (0.0, 0.4), "RK4"
     here = sv.simulate_many(*arguments, paths={"r": paths}, t_eval=[0.2, 0.4])
     with ProcessPoolExecutor(1) as pool:
