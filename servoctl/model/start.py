@@ -17,7 +17,7 @@ from servoctl.model.jets import jet_names_to
 from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
 from servoctl.model.variants import derived_near, reordered_at, strong_near
 from servoctl.spec.mechanism import require_known
-from servoctl.spec.references import function_of, names_in
+from servoctl.spec.references import function_of, orders_in
 from servoctl.values import Value, frozen
 
 TOLERANCE = 1e-10  # largest residual relative to its gradient times the state; Newton's iteration reaches rounding
@@ -250,7 +250,7 @@ def _rests(model, equations, aim, held, conditions):
     """The equations, and the rest nearest to the guess before others, where a path begins at rest; else None."""
     t, q, residuals = equations.t, model.reduction.mechanism.q, model.reduction.program.residuals.values()
     rates = held.keys() - set(q.names)
-    moves = names_in(q, residuals) or any(ca.depends_on(e, q.t) for e in residuals)
+    moves = orders_in(q, residuals) or any(ca.depends_on(e, q.t) for e in residuals)
     if not moves or any(held[name] for name in rates):
         return None
     chosen = zip(q.names, aim.reference, aim.guessed | ~aim.movable, strict=False)
