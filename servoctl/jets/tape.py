@@ -549,9 +549,10 @@ class Scalars:
 
     def inputs(self, t, z, values):
         """Values of the symbols (n, N) at instants t (N, 1 + R) and jets z (nz, N); jets of a higher level are zero."""
-        known = 1 + self._top * (JETS + 1)
-        constants = np.broadcast_to(np.append(0.0, values)[:, None], (1 + len(values), len(t)))
-        sources = np.vstack([constants, np.reshape(t, (len(t), -1))[:, :known].T, z]).astype(REAL)
+        first, known = 1 + len(values), 1 + self._top * (JETS + 1)
+        sources = np.empty((first + known + len(z), len(t)), dtype=REAL)
+        sources[0], sources[1:first], sources[first + known :] = 0.0, values[:, None], z
+        sources[first : first + known] = np.reshape(t, (len(t), -1))[:, :known].T
         return sources[[row if row < len(sources) else 0 for row in self._rows]] * self._factors
 
     def values(self, t, z, values):
