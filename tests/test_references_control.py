@@ -13,14 +13,15 @@ from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.spec.shapes import heights, moved
 
 ROUNDING = 1e-11  # of each signal's largest value, after 200 samples under a law
+OF_FILTER = 1e-9  # the same, where the steady solution of a filter's Riccati equation amplifies it
 SPAN = (0.0, 2.0)
 
 
-def same(a, b, names):
+def same(a, b, names, within=ROUNDING):
     """Signals of two runs are equal to rounding."""
     for name in names:
         size = max(np.abs(b[name]).max(), 1e-9)
-        assert np.abs(a[name] - b[name]).max() <= ROUNDING * size, name
+        assert np.abs(a[name] - b[name]).max() <= within * size, name
 
 
 def planned(mechanism, residual, **start):
@@ -111,11 +112,12 @@ LAWS = {
 @pytest.mark.parametrize("law", LAWS)
 def test_loops_as_along_formulas(both, law):
     new, old = (pushed(scene, LAWS[law]) for scene in both)
-    same(new, old, old.names)
+    within = OF_FILTER if law == "estimated" else ROUNDING
+    same(new, old, old.names, within)
     assert list(new.residual) == list(old.residual)
     for name, values in old.residual.items():
-        assert np.abs(new.residual[name] - values).max() < 1e-12
-    assert np.abs(new.signals - old.signals).max(initial=0.0) < 1e-10
+        assert np.abs(new.residual[name] - values).max() < within / 10
+    assert np.abs(new.signals - old.signals).max(initial=0.0) < 10 * within
     if law == "limited" and new.plant.constrained:
         assert 0 < np.mean(new.signal["bound multiplier_beam"] != 0) < 1
 

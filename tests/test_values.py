@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import FrozenInstanceError, dataclass, field, fields, replace
 
 import casadi as ca
+import conftest  # noqa: F401 - workers compile as tests do
 import numpy as np
 import pytest
 from refusals import refused

@@ -126,6 +126,7 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
             list(program.residuals),
             program.by,
             program.metric,
+            program.jumps,
             *(
                 [(name, None if isinstance(e, ca.SX) else float(e)) for name, e in chosen.items()]
                 for chosen in (program.weights, program.toward)
