@@ -45,6 +45,12 @@ def c_compiler(monkeypatch):
 
 
 @pytest.fixture
+def as_shipped(monkeypatch):
+    """Optimised as users have it: rounding shows in printed digits."""
+    monkeypatch.setattr(function, "FULLY_OPTIMISED", FULLY_OPTIMISED)
+
+
+@pytest.fixture
 def uncompiled(monkeypatch):
     """No compiler, where each model is evaluated too few times to be worth compiling."""
     monkeypatch.setenv("SERVOCTL_COMPILER", "none")

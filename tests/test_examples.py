@@ -213,7 +213,7 @@ def test_the_page_of_examples_has_all_of_them():
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
-def test_every_example_is_verified_and_returns_numbers(path):
+def test_every_example_is_verified_and_returns_numbers(path, as_shipped):
     """Those of the page, and of its checks."""
     result = runpy.run_path(str(path))["main"](fast=True)
     verified = [value for name, value in result.items() if name.endswith("verified")]

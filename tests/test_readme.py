@@ -54,7 +54,7 @@ def settled(text):
 
 
 @pages
-def test_python_blocks_execute_and_print_what_is_shown(page, tmp_path, monkeypatch):
+def test_python_blocks_execute_and_print_what_is_shown(page, tmp_path, monkeypatch, as_shipped):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     shown, printed, names = blocks(page, "text"), io.StringIO(), {}
     with contextlib.redirect_stdout(printed):
