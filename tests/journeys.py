@@ -114,9 +114,13 @@ def travelled(wanted):
 
     matplotlib.use("Agg")
     measured = coverage.Coverage(data_file=None, source_pkgs=["servoctl"], config_file=False)
-    sys.path.insert(0, str(ROOT))
+    sys.path[:0] = str(ROOT), str(ROOT / "examples")
     with tempfile.TemporaryDirectory() as folder:
-        os.chdir(folder)
+        work = Path(folder) / "work"  # beside which notebooks find the examples, and in which pages do
+        work.mkdir()
+        for place in (Path(folder), work):
+            (place / "examples").symlink_to(ROOT / "examples")
+        os.chdir(work)
         measured.start()
         for journey, steps in journeys().items():
             for name, step in steps if journey in wanted else ():
