@@ -256,3 +256,15 @@ def test_compiled_jets_are_those_of_the_path():
     values = f.grid(t, np.zeros((1, len(t))), np.array([paths.address]))[:-1].reshape(7, 2, -1)
     exact = path.jets(t, 6)
     assert f.backend == "c" and np.all(np.abs(values - exact) <= 1e-13 * np.abs(exact).max(axis=2, keepdims=True))
+
+
+def test_equal_mechanisms_that_travelled_keep_references_of_their_own():
+    """An equal mechanism without references, or along other paths, came first: the copy is not taken for it."""
+    bare, _ = crane()
+    models = [followed(), followed(0.5 * PATH)]
+    copies = [pickle.loads(pickle.dumps(value)) for value in (bare, *models)][1:]
+    for model, copy in zip(models, copies, strict=True):
+        assert copy == model and copy.paths == model.paths
+        assert copy.reduction.mechanism.q.family.paths == model.reduction.mechanism.q.family.paths
+        run, other = (sv.simulate(m, m.start(guess={"l": float(m.paths["Z"](0.0))}), (0.0, 6.0)) for m in (model, copy))
+        same(other, run, 1e-12)

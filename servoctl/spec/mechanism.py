@@ -634,12 +634,15 @@ def _unit_along(direction, rates):
 def _restored(q, parameters, content):
     mechanism = object.__new__(Mechanism)
     vars(mechanism).update(unpacked(content, q, parameters, {"parameters": parameters}))
-    return _latest(mechanism)
+    return _latest(mechanism, tuple(q.family.paths.items()))
 
 
 @lru_cache(32)
-def _latest(mechanism):
-    """The first of equal mechanisms from other processes, so that models derived from it are shared."""
+def _latest(mechanism, references):
+    """The first of equal mechanisms from other processes, so that models derived from it are shared.
+
+    Its coordinates have the same references with the same paths.
+    """
     return mechanism
 
 
