@@ -7,6 +7,7 @@ from multiprocessing import get_context
 from threading import Thread
 
 import casadi as ca
+import conftest  # noqa: F401 - workers compile as tests do
 import numpy as np
 import pytest
 from refusals import refused
@@ -477,7 +478,14 @@ def same_motions(some, others):
         np.testing.assert_array_equal(some.trace[name], others.trace[name])
 
 
-@pytest.mark.parametrize("pool", [ThreadPoolExecutor, partial(ProcessPoolExecutor, mp_context=get_context("spawn"))])
+def compile_as_tests_do():
+    """What a spawned worker calls first: the name leads it to this module, and so to conftest."""
+
+
+SPAWNED = partial(ProcessPoolExecutor, mp_context=get_context("spawn"), initializer=compile_as_tests_do)
+
+
+@pytest.mark.parametrize("pool", [ThreadPoolExecutor, SPAWNED])
 def test_an_executor_computes_the_same_bits(pool, gallery_model, c_compiler):
     """Lanes, plans of one model and of several, starts of all forms, and cases that fail."""
     rod = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
