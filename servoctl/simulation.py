@@ -48,7 +48,6 @@ from servoctl.methods.stability import run_checked, warn_drifted, warn_many_step
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
 from servoctl.model.equations import invariant_names
-from servoctl.model.following import breaks_within
 from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.model.model import Model, including, knots_within
 from servoctl.model.start import State
@@ -222,11 +221,12 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     method, drift = _method_and_drift(model, method, drift, t0, t1)
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, Poles)
     x0 = as_state(model, start, t0) if leads_back else consistent_state(model, start, t0, isinstance(drift, Project))
-    knots = knots_within(model, span)
-    if not isinstance(method, Algebraic):
+    if isinstance(method, Algebraic):
+        knots = knots_within(model, span)
+    else:
+        knots = knots_within(model, span, method.order if isinstance(method, RungeKutta) else np.inf)
         ends = model.reduction.switches.ends_of_pieces(model.parameters, (min(span), max(span)))
-        order = method.order if isinstance(method, RungeKutta) else np.inf
-        knots = tuple(sorted({*knots, *ends.tolist(), *breaks_within(model, span, order).tolist()}))
+        knots = tuple(sorted({*knots, *ends.tolist()}))
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:

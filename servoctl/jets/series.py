@@ -16,7 +16,20 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.tape import JETS, REAL, Scalars, add, apply, divide, finite, holds, multiply, select, subtract
+from servoctl.jets.tape import (
+    JETS,
+    REAL,
+    Scalars,
+    add,
+    apply,
+    column_of,
+    divide,
+    finite,
+    holds,
+    multiply,
+    select,
+    subtract,
+)
 
 _NUMBERS = (float, int)
 OVERFLOWING = 1e100  # a divisor beyond it, of which a coefficient has overflown, is infinite
@@ -235,8 +248,7 @@ class _Grouped(Series):
 class Motion:
     """The normalised Taylor coefficients of every symbol along a motion.
 
-    Subclasses define `coordinate(i, j)`, coefficient j of q_i, and `velocity(i, l, j)` and `reference(i, l, j)`, those
-    of γ_i^(l) and r_i^(l).
+    Subclasses define `coordinate(i, j)`, coefficient j of q_i, and `velocity(i, l, j)`, coefficient j of γ_i^(l).
     """
 
     def __init__(self, q):
@@ -261,6 +273,10 @@ class Motion:
                 limit=JETS,
             )
         return symbol if j == 0 else float(kind == "t" and j == 1)
+
+    def reference(self, i, level, j):
+        """Coefficient j of r_i^(level): a symbol, unless the motion has numbers."""
+        return divide(self.q.family.jet(self.q.family.names[i], level + j), float(factorial(j)))
 
 
 def shifted(c, level, j):
@@ -491,4 +507,4 @@ class _Numbers(Motion):
         return shifted(self.z[self.q.nq + (level + j - 1) * self.q.n + i], level, j)
 
     def reference(self, i, level, j):
-        return shifted(self.t[:, 1 + i * (JETS + 1) + level + j], level, j)
+        return shifted(self.t[:, column_of(i, level + j)], level, j)

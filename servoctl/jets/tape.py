@@ -517,6 +517,11 @@ def evaluate(tape, inputs, operations=None):
         return v[outputs], tape.plan.sizes(v)[outputs]
 
 
+def column_of(i, k):
+    """The column of coefficient k of the reference i in an instant, after the time."""
+    return 1 + i * (JETS + 1) + k
+
+
 class Scalars:
     """SX scalars on one tape, with the places of their symbols in jet space.
 
@@ -541,7 +546,7 @@ class Scalars:
             else:
                 kind, level, k = place
                 if kind == "r":
-                    row = instant + 1 + k * (JETS + 1) + level
+                    row = instant + column_of(k, level)
                 else:
                     row = k + (first["q"] + q.nq + (level - 1) * q.n if kind == "w" else first[kind])
                 self._rows.append(row)

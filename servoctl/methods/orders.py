@@ -9,6 +9,8 @@ from servoctl.reduction.orders import other_order
 def end_where_orders_change(motion):
     """Cut a motion in place before the first sample at which a row has another order, and set the error as its stop."""
     for model, t, jets in motion.by_piece():
+        if not model.reduction.orders:  # which rest on no slope
+            continue
         k, name = model.reduction.orders.first_change(instants_of(model, t), jets, model.parameters)
         if k is not None:
             motion.end_before(t[k], _other_order(model, name, float(t[k]), jets[:, k]))

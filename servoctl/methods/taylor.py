@@ -142,9 +142,6 @@ class _Motion(Motion):
     def velocity(self, i, level, j):
         return shifted(self.gamma[level + j][i], level, j)
 
-    def reference(self, i, level, j):
-        return self.q.family.jet(self.q.family.names[i], level + j) / factorial(j)
-
 
 class _Rows:
     """The rows of a reduction along a motion, whose coefficients they give index by index.

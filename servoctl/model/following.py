@@ -60,6 +60,12 @@ def require_class(name, path, needs, span, jumps):
         )
 
 
+def places_of(models):
+    """The places in memory (1, N) of the paths of models, (0, N) without references, at which their p begin."""
+    size = 1 if models and models[0].paths else 0
+    return np.reshape([model.p[:size] for model in models], (len(models), size)).T
+
+
 def p_with(model, parameters):
     """The parameters of a model's compiled functions, with others (n_p,) or (n_p, N) than its own."""
     return with_place((model._followed.address,) if model.paths else (), parameters)

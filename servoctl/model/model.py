@@ -30,7 +30,7 @@ from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.spec.references import followed_path, required_paths
+from servoctl.spec.references import other_paths, required_paths
 from servoctl.values import evenly, read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
@@ -229,8 +229,7 @@ class Model(Detailed):
         SpecificationError
             For what is no path of one component.
         """
-        changes = by_name(paths, self.paths, "reference", "The references")
-        paths = self.paths | {name: followed_path(name, path) for name, path in changes.items()}
+        paths = other_paths(self.paths, paths)
         return Model(self.reduction, self._store, self.parameters, self._knots, self._functions, paths=paths)
 
     def _with(self, other, functions, variants=None):

@@ -26,7 +26,7 @@ from servoctl.markup import Shown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
 from servoctl.reduction.manifold import references_at
 from servoctl.spec.mechanism import Mechanism, require_known
-from servoctl.spec.references import followed_path, required_paths
+from servoctl.spec.references import other_paths, required_paths
 from servoctl.values import Value, frozen
 
 
@@ -234,8 +234,7 @@ class Plant(Value, Shown):
         SpecificationError
             For what is no path of one component.
         """
-        changes = by_name(paths, self.paths, "reference", "The references")
-        return replace(self, paths=self.paths | {name: followed_path(name, path) for name, path in changes.items()})
+        return replace(self, paths=other_paths(self.paths, paths))
 
     @cached_property
     def _followed(self):

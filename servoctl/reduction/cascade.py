@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.jets.series import Motion, Series, is_zero, shifted
-from servoctl.jets.tape import JETS, REAL, Tape, add, divide, multiply
+from servoctl.jets.tape import REAL, Tape, add, column_of, divide, multiply
 from servoctl.reduction.ranks import clean, eliminate, pivot_order, solve_clean
 from servoctl.values import frozen
 
@@ -250,10 +250,6 @@ class Expressions(_Follow):
         self.levels, self.newton, self.pivots = {}, [ca.SX(0)] * q.nq, []
         self.passed_on = {cascade.blocks[m].places for jets in cascade.jets for _, m in jets}
 
-    def reference(self, i, level, j):
-        """Coefficient j of r_i^(level), a symbol."""
-        return divide(self.q.family.jet(self.q.family.names[i], level + j), float(factorial(j)))
-
     def jet(self, k):
         """γ^(k), or q, of this motion, SX."""
         return ca.vertcat(*(self.place[0] if k == 0 else [c * float(factorial(k)) for c in self.gamma[k]]))
@@ -334,7 +330,7 @@ class _Numbers(_Follow):
 
     def reference(self, i, level, j):
         """Coefficient j of r_i^(level) at the points, (N,)."""
-        return shifted(self.points.instants[:, 1 + i * (JETS + 1) + level + j].astype(REAL), level, j)
+        return shifted(self.points.instants[:, column_of(i, level + j)].astype(REAL), level, j)
 
     def z(self):
         """The jets (nz, N)."""

@@ -261,6 +261,8 @@ def _reduced(mechanism, program, switches, balance, context):
 
 def references(mechanism, program, further=()):
     """Names of the references in the expressions of a specification, and in further ones."""
+    if not len(mechanism.q.family):
+        return ()
     m, chosen = mechanism, (*program.weights.values(), *program.toward.values())
     of_program = (*program.with_turns.values(), *(e for e in chosen if isinstance(e, ca.SX)))
     named_rows = (*m.constraints.values(), *m.followers.values(), *m.outputs.values(), *m.reported.values())

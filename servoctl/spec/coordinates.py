@@ -406,9 +406,6 @@ class _SymbolicMotion(Motion):
     def velocity(self, i, level, j):
         return divide(self.q.gamma(level + j)[i], float(factorial(j)))
 
-    def reference(self, i, level, j):
-        return divide(self.q.family.jet(self.q.family.names[i], level + j), float(factorial(j)))
-
 
 def symbols_in(expression):
     """The symbols in an SX expression; CasADi's search is left out where there is nothing to search."""

@@ -6,9 +6,9 @@ from math import factorial
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import named, whole_of
+from servoctl.checks import by_name, named, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.jets.tape import JETS
+from servoctl.jets.tape import JETS, column_of
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import Path
 
@@ -27,11 +27,6 @@ class References:
 
     def __init__(self, family, names):
         self._family, self.names = family, tuple(names)
-
-    @property
-    def paths(self):
-        """The paths that are followed until told otherwise, by name; None where there is none yet."""
-        return {name: self._family.paths[name] for name in self.names}
 
     def __getitem__(self, name):
         return self._family.jet(named(name, self.names, "reference"), 0)
@@ -156,7 +151,7 @@ class Jets:
 
     def of(self, instants):
         """Their values (n, N) at instants (N, 1 + R) of points."""
-        columns = [1 + self._names.index(name) * (JETS + 1) + k for name, k in self.places]
+        columns = [column_of(self._names.index(name), k) for name, k in self.places]
         sizes = np.array([[factorial(k)] for _, k in self.places], dtype=float).reshape(-1, 1)
         return np.asarray(instants[:, columns], dtype=float).T * sizes
 
@@ -179,6 +174,12 @@ def required_paths(paths):
     return paths
 
 
+def other_paths(paths, changes):
+    """The paths by name, some of them changed."""
+    changes = by_name(changes, paths, "reference", "The references")
+    return paths | {name: followed_path(name, path) for name, path in changes.items()}
+
+
 def followed_path(name, path):
     """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
     path = path if path is None or isinstance(path, Path) else as_path(path)
@@ -196,9 +197,5 @@ def followed_path(name, path):
 
 def rates_in_time(q, expressions):
     """The partial derivatives (n,) of SX expressions (n,) by the time, along the paths of their references."""
-    rates = ca.jacobian(expressions, q.t)
-    for symbol in ca.symvar(expressions):
-        place = q.where(symbol)
-        if place and place[0] == "r":
-            rates += ca.jacobian(expressions, symbol) * q.family.jet(q.family.names[place[2]], place[1] + 1)
-    return rates
+    jets = Jets(q, [expressions])
+    return ca.jacobian(expressions, q.t) + ca.jacobian(expressions, jets.symbols) @ jets.rates

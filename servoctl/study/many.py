@@ -14,6 +14,7 @@ from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
+from servoctl.model.following import places_of
 from servoctl.model.model import Model, including, knots_within
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
@@ -191,8 +192,7 @@ class _Many:
 
     def numbers(self, which, p):
         """Parameters p (N, n_p) of some cases as functions have them: after the places of the paths."""
-        size = 1 if self.model.paths else 0
-        return np.hstack([np.reshape([model.p[:size] for model in self.along(which)], (len(p), size)), p])
+        return np.hstack([places_of(self.along(which)).T, p])
 
     def start(self, i, model, t):
         """The start of a case."""

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from servoctl.model.equations import signal_groups
+from servoctl.model.following import places_of
 from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.run import ByName, Run
 
@@ -61,9 +62,7 @@ class Signals(ByName, Mapping):
         """A function of the jets, or the highest of these, (n, K, N) for some motions."""
         model, count = self._model, len(part)
         t, numbers = np.repeat(self._t, count), self._parameters[:, part]
-        size = 1 if model.paths else 0
-        places = np.reshape([self._models[i].p[:size] for i in part], (count, size))
-        p = np.tile(np.vstack([places.T, numbers]), len(self._t))
+        p = np.tile(np.vstack([places_of([self._models[i] for i in part]), numbers]), len(self._t))
         jets = with_highest(model, t, self._states[:, :, part].reshape(len(self._states), -1), p)
         y = jets[len(self._states) :] if f is None else f.grid(t, jets[: f.n_x], p)
         return y.reshape(len(y), len(self._t), count)
