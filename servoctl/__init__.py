@@ -20,6 +20,7 @@ HOMES = {  # of each public name: the module that defines it, or that it is; imp
     "close_many": "study.close_many",
     "computed": "control.inverse_dynamics",
     "coordinates": "spec.coordinates",
+    "curves": "spec.curves",
     "derive": "model.model",
     "design": "inversion.design",
     "disturbances": "control.disturbances",

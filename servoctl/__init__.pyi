@@ -36,6 +36,7 @@ from servoctl.robots.robot import urdf as urdf
 from servoctl.sensitivities.identification import identify as identify
 from servoctl.sensitivities.sensitivity import sensitivity as sensitivity
 from servoctl.simulation import simulate as simulate
+from servoctl.spec import curves as curves
 from servoctl.spec import paths as paths
 from servoctl.spec import rotations as rotations
 from servoctl.spec import shapes as shapes

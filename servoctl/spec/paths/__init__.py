@@ -11,7 +11,8 @@ separate: the first argument is `q.t` or another expression, the time law. A pat
 classes.
 """
 
-from servoctl.spec.paths.expressions import circle, line, piecewise
+from servoctl.spec.curves import circle, line
+from servoctl.spec.paths.expressions import piecewise
 from servoctl.spec.paths.fit import fit, function
 from servoctl.spec.paths.makers import polynomials, rest_to_rest, s_curve, trapezoid
 from servoctl.spec.paths.makers import spline_through as spline
