@@ -228,10 +228,10 @@ class Compiled:
         (S + 1, 1 + n_x + n_y); it lies before the last end if the step length vanishes, or S is `max_steps`.
         """
         self._require_loop("taylor")
-        self._place(self._library, t0, x0, p)
-        every = project_every if self._project is not None else 0
+        library, every = self._library, project_every if self._project is not None else 0
+        self._place(library, t0, x0, p)
         atol, weights = (atol, None) if isinstance(atol, float) else weighted(atol)
-        rows = self._library.taylor(ends, rtol, atol, every, max_steps, weights)
+        rows = library.taylor(ends, rtol, atol, every, max_steps, weights)
         self._in_loops += len(rows)
         return rows
 
@@ -317,9 +317,9 @@ class Compiled:
     @property
     def _library(self):
         """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
-        if self._too_long:
-            return self._interpreter
-        return self._loaded("_library", self.source, lambda: self._level)
+        if (found := vars(self).get("_library")) is not None:
+            return found
+        return self._interpreter if self._too_long else self._loaded("_library", self.source, lambda: self._level)
 
     @property
     def _lanes(self):
@@ -330,9 +330,9 @@ class Compiled:
 
     def _loaded(self, name, source, level):
         """Evaluator by the library of a C text, which takes long to write and is not written without a compiler."""
-        if os.environ.get("SERVOCTL_COMPILER") == "none":
-            return self._interpreter
         if name not in vars(self):
+            if os.environ.get("SERVOCTL_COMPILER") == "none":
+                return self._interpreter
             text = (source(), level()) if compiler.compiler() else ("",)
             library = compiler.library(*text, calls=self._in_loops)
             if library is None and not compiler.worth_compiling(self._in_loops):
