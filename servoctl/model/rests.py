@@ -80,7 +80,9 @@ class Rests:
             if not np.isfinite(slopes).all() or largest >= least <= MET:
                 break
             best, least = (z, largest) if largest < least else (best, least)
-            z = z + self._step(rows, slopes, movable, weights, movable & False if angles is None else angles)
+            last, z = z, z + self._step(rows, slopes, movable, weights, movable & False if angles is None else angles)
+            if np.all(np.abs(z - last) <= ENTRY * (1.0 + np.abs(last))):  # no step leads on
+                break
         rows, _, off = (part[some] for part in self.measured(t, best, p))
         if not len(rows):
             return best, True, None
@@ -116,11 +118,12 @@ class Rests:
         known, movable = np.isin(self.coordinates, list(guess)), ~np.isin(self.coordinates, list(fixed))
         angles, sizes = self.angles(t, p, first), next(roots_of_inertia(self._frame, t, first, p))
         found, reason, weights = [], None, sizes * np.where(known, GUESSED, 1.0)
-        balanced, _, _ = self.reached(t, p, first, movable & ~known, sizes, slice(self.n), angles)
+        balanced = self.reached(t, p, first, movable & ~known, sizes, slice(self.n), angles)[0][: self.nq]
+        starts = (first,) if np.array_equal(balanced, first) else (first, balanced)
         for turned in self._turns(angles & movable):
             if found and 0.5 in np.abs(turned):
                 break
-            for start in (first, balanced[: self.nq]):
+            for start in starts:
                 q = self._met(t, p, start + turned * np.pi, known, movable, angles, sizes)
                 z, rests, worst = self.reached(t, p, q, movable, weights, angles=angles)
                 reason = reason or worst
@@ -135,7 +138,7 @@ class Rests:
         yield 0.0 * angles
         if angles.any():
             yield from np.eye(len(angles))[angles]
-            yield from (k * angles for k in (1.0, 0.5, -0.5))
+            yield from (k * angles for k in (*([1.0] if angles.sum() > 1 else []), 0.5, -0.5))
 
     def _alike(self, z, other, angles):
         """Whether rests differ by full turns only."""
