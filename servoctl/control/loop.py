@@ -134,7 +134,7 @@ def _native(native, law, loop, logs):
     sizes = {"n_y": len(loop.measured), "n_z": len(loop.z0), "n_d": len(loop.disturbed), "rows": rows, "n_row": n_row}
     sizes["stride"] = logs["law_x"].shape[1] if len(logs["law_x"]) > 1 else 0
     goes_on = {"state": loop.x0.copy(), "steps": FIRST_PIECE, "status": PAUSED}
-    arguments = Arguments(**vars(loop) | sizes | logs | goes_on)
+    arguments = Arguments(**vars(loop) | sizes | logs | goes_on | _unlimited(loop))
     native.restype = ctypes.c_int64
     call, done = (ctypes.cast(step, ctypes.c_void_p), ctypes.byref(arguments)), 0
     try:
@@ -150,6 +150,12 @@ def _native(native, law, loop, logs):
         return done, status
     given = logs["law_x"][done] if sizes["stride"] else logs["x"][done, loop.measured]
     return done, _raised(law, loop, done, given) or status
+
+
+def _unlimited(loop):
+    """None for limits that limit nothing, which C does not ask for at every sample."""
+    limits = {("low", "high"): [loop.low, loop.high], ("change",): loop.change}
+    return {name: None for names, values in limits.items() if np.isinf(values).all() for name in names}
 
 
 def _raised(law, loop, k, given):

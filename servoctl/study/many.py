@@ -380,6 +380,7 @@ class _Many:
 
     def signals(self, which, t, count, level):
         """The signals of the finished cases at the instants t, of which the first so many are those of the traces."""
-        runs = {k: self.runs[i] for k, i in enumerate(which.tolist()) if i in self.runs}
+        places = {i: k for k, i in enumerate(which.tolist())} if self.runs else {}
+        runs = {places[i]: run for i, run in self.runs.items() if i in places}
         states, p = self.samples[which].transpose(2, 1, 0), self.parameters[which].T
         return Signals(self.along(which), self.model, t, count, states, p, level, runs)

@@ -172,19 +172,24 @@ INLINE void rates_at(double t, const double *d, Cases *s, W x[][NX + NV + 1], W 
 #define AT(v) v[g][i]
 #define RATES(stage, instant, state, k) rates_at(instant, d + stage * ND, s, state, k)
 
+INLINE double begin_of_step(const Loop *c, int64_t k, int64_t i)
+{
+    return c->t0 + (double)k * c->period + (double)i * (c->period / (double)c->substeps);
+}
+
 /* A part of step i of sample k begins: its inputs, and the rates k1. After a sample it shares with it what depends on x alone. */
 INLINE void start(const Loop *c, int64_t k, int64_t i, int64_t part, Cases *s, W x[][NX + NV + 1], W k1[][NX + 1])
 {
     const double *d = c->disturbance + 3 * part * ND;
     if (c->transport) EACH_VECTOR(g) transported(c, k * c->substeps + i, s + g);
-    RATES(0, begin_of(c, k, i, part), x, k1);
+    RATES(0, begin_of(c, begin_of_step(c, k, i), part), x, k1);
 }
 
 /* It, of a block, with the rates k1 at its start. */
 INLINE void advance(const Loop *c, int64_t k, int64_t i, int64_t part, Cases *s, W x[][NX + NV + 1], W k1[][NX + 1])
 {
     W k2[VECTORS][NX + 1], k3[VECTORS][NX + 1], k4[VECTORS][NX + 1], z[VECTORS][NX + NV + 1];
-    const double h = length_of(c, part, c->period / (double)c->substeps), t = begin_of(c, k, i, part);
+    const double h = length_of(c, part, c->period / (double)c->substeps), t = begin_of(c, begin_of_step(c, k, i), part);
     const double *d = c->disturbance + 3 * part * ND;
 #include "rk4.h"
 #ifdef PROJECTED

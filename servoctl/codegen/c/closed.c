@@ -75,8 +75,9 @@ int64_t FN(closed)(Step *law, Loop *c)
                 const int64_t sent = step - c->transport[i];
                 p[c->at_u + i] = sent < 0 ? c->initial_input[i] : c->input[sent / c->substeps * c->n_u + i];
             }
-            for (int64_t i = first_part(c, step); i < first_part(c, step + 1); i++) {
-                const double begun = begin_of(c, k, s, i), length = length_of(c, i, h);
+            const int64_t last = first_part(c, step + 1);
+            for (int64_t i = first_part(c, step); i < last; i++) {
+                const double begun = begin_of(c, t + (double)s * h, i), length = length_of(c, i, h);
                 advance(c, begun, length, c->disturbance + 3 * i * c->n_d, x, p);
                 restore(begun + length, x, p);
             }

@@ -20,13 +20,9 @@ typedef struct {
     Step *law;                         /* which is called, where the law is not written into the loop */
 } Loop;
 
-/* Edges of disturbances cut integration steps into parts: the first of a step; begin [s] of one of step i of sample k. */
+/* Edges of disturbances cut integration steps into parts: the first of a step; begin [s] of one of a step, and length. */
 INLINE int64_t first_part(const Loop *c, int64_t step) { return c->parts ? c->parts[step] : step; }
-INLINE double begin_of(const Loop *c, int64_t k, int64_t i, int64_t part)
-{
-    const double step = c->t0 + (double)k * c->period + (double)i * (c->period / (double)c->substeps);
-    return c->parts ? step + c->spans[2 * part] : step;
-}
+INLINE double begin_of(const Loop *c, double step, int64_t part) { return c->parts ? step + c->spans[2 * part] : step; }
 INLINE double length_of(const Loop *c, int64_t part, double h) { return c->parts ? c->spans[2 * part + 1] : h; }
 
 INLINE V quantised(const Loop *c, int64_t i, V value)
