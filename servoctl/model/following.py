@@ -13,19 +13,17 @@ from servoctl.spec.references import required_paths
 SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
 
 
-def breaks_within(model, span, smoother=np.inf):
-    """Instants (N,) within a span at which a path has fewer continuous derivatives than a motion by some method needs.
+def breaks_within(model, span, smoother=SMOOTHER):
+    """Instants within a span at which a path has fewer continuous derivatives than a motion by some method needs.
 
     That are `smoother` more than the actuation contains. SpecificationError where it has fewer than these.
     """
-    if not model.paths:
-        return np.zeros(0)
-    low, high, found = min(span), max(span), []
+    low, high, found = min(span), max(span), set()
     for name, path in model.paths.items():
         needs = model.reduction.follows[name]
         require_class(name, path, needs, (low, high), model.reduction.program.jumps)
-        found.append(path.held().breaks_below(needs + smoother, low, high))
-    return np.unique(np.concatenate(found))
+        found |= {*path.held().breaks_below(needs + smoother, low, high).tolist()}
+    return tuple(sorted(found))
 
 
 def require_class(name, path, needs, span, jumps):
@@ -83,6 +81,6 @@ def instants_of(model, t):
 
 
 def corners_of(model):
-    """Instants at which paths switch between smooth pieces, with the breaks of those that references follow."""
+    """Instants at which the paths that a model follows have a break."""
     paths = required_paths(model.paths).values()
-    return tuple(sorted({*model.knots, *chain.from_iterable(path.breaks[np.isfinite(path.classes)] for path in paths)}))
+    return tuple(sorted({*chain.from_iterable(path.breaks[np.isfinite(path.classes)].tolist() for path in paths)}))

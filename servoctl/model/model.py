@@ -14,7 +14,7 @@ from servoctl.codegen.paths import Followed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
-from servoctl.model.following import SMOOTHER, breaks_within, instants_of, p_with
+from servoctl.model.following import instants_of, p_with
 from servoctl.model.jets import jet_names_to
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
@@ -25,7 +25,6 @@ from servoctl.model.variants import form_of, place_of
 from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
-from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
@@ -63,8 +62,8 @@ def derive(
     Raises
     ------
     SpecificationError
-        For constraints that depend on or contradict each other, an unknown symbol, a path that is not smooth
-        enough, a singular mass matrix.
+        For constraints that depend on or contradict each other, an unknown symbol, a switch in q.t, a singular mass
+        matrix.
     NotRealisable
         If the actuators cannot realise the program.
     SingularProgram
@@ -106,25 +105,6 @@ def default_start(model: "Model", t: float = 0.0) -> State:
     return model.start(t, {name: value for name, value in guess.items() if name in model.state_names})
 
 
-def knots_within(model: "Model", span: tuple, smoother=SMOOTHER) -> tuple:
-    """Knots of the paths within a span, in either direction; SpecificationError if a path is not smooth enough there.
-
-    Of paths of references those with fewer than `smoother` continuous derivatives beyond those in the actuation.
-    Of a spline of many pieces they are those between the first and the last that are inspected; the others, at which
-    series end, are `Switches.ends_of_pieces`.
-    """
-    r, span = model.reduction, (min(span), max(span))
-    if r.timed and span not in model._knots_within:
-
-        def build():
-            return require_smooth(r.switches, model.parameters, r.smoothness, span).times
-
-        # The entries of the store belong to the numbers of the specification.
-        stored = np.array_equal(model.parameters, r.context.values)
-        model._knots_within[span] = model._store.recall(f"knots {span}", build) if stored else build()
-    return tuple(sorted({*model._knots_within.get(span, ()), *breaks_within(model, span, smoother).tolist()}))
-
-
 class Model(Detailed):
     """Reduced dynamics and required actuation of a program; made by `derive`.
 
@@ -143,17 +123,15 @@ class Model(Detailed):
         Names of the jets Z = (X, γ^(s̄)).
     """
 
-    def __init__(self, reduction, store, values=None, knots=None, functions=None, variants=None, paths=None):
+    def __init__(self, reduction, store, values=None, functions=None, variants=None, paths=None):
         q = reduction.mechanism.q
         self.paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
         self.reduction, self._store = reduction, store
         self.parameters = read_only(reduction.context.values.copy() if values is None else values)
-        self._knots = reduction.knots if knots is None else knots
         self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
         self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
         # Models that differ only in numbers share their functions.
         self._functions = {} if functions is None else functions
-        self._knots_within = {}  # by time span
         self._variants = {None: self} if variants is None else variants  # with other pivots: one set for all of them
 
     @classmethod
@@ -175,7 +153,7 @@ class Model(Detailed):
 
     def __reduce__(self):
         mechanism, _, *choices = self._store.specification
-        return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self._knots, self.paths)
+        return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self.paths)
 
     def with_parameters(self, **changes: float) -> "Model":
         """The same model with other parameters.
@@ -196,7 +174,7 @@ class Model(Detailed):
         NameUnknown
             For a name that is no parameter.
         SpecificationError
-            For a value that is not finite, makes a mass negative, or makes a path less smooth than required.
+            For a value that is not finite, or makes a mass negative.
         """
         r = self.reduction
         current = self.numbers
@@ -207,8 +185,7 @@ class Model(Detailed):
             if not self._holds(values):
                 self._store.require_unchanged()
                 return self._of(r.mechanism, r.program, r.context.guess, None, values)
-        knots = require_smooth(r.switches, values, r.smoothness)
-        return Model(r, self._store, values, knots, self._functions, paths=self.paths)
+        return Model(r, self._store, values, self._functions, paths=self.paths)
 
     def with_references(self, **paths) -> "Model":
         """The same model along other paths: nothing is derived, and nothing compiled.
@@ -230,11 +207,11 @@ class Model(Detailed):
             For what is no path of one component.
         """
         paths = other_paths(self.paths, paths)
-        return Model(self.reduction, self._store, self.parameters, self._knots, self._functions, paths=paths)
+        return Model(self.reduction, self._store, self.parameters, self._functions, paths=paths)
 
     def _with(self, other, functions, variants=None):
         """The reduction of another model with the numbers and paths of this one."""
-        return Model(other.reduction, other._store, self.parameters, self._knots, functions, variants, self.paths)
+        return Model(other.reduction, other._store, self.parameters, functions, variants, self.paths)
 
     @cached_property
     def _followed(self):
@@ -288,11 +265,6 @@ class Model(Detailed):
         """Names of the mechanism's outputs."""
         mechanism = self.reduction.mechanism
         return tuple(name for name in mechanism.outputs if name not in mechanism.inputs)
-
-    @property
-    def knots(self):
-        """Instants [s] at which paths switch between smooth pieces."""
-        return self._knots.times
 
     @cached_property
     def equations(self):
@@ -456,8 +428,8 @@ def _samples(model, motion, jets):
     return t, jets
 
 
-def _unpickled(mechanism, content, choices, parameters, knots, paths):
+def _unpickled(mechanism, content, choices, parameters, paths):
     reduction = unpack(content, mechanism)
     store = Store(mechanism, reduction.program, *choices)
     form = form_of(reduction)
-    return Model(reduction, store.part(form) if form else store, parameters, knots, paths=paths)
+    return Model(reduction, store.part(form) if form else store, parameters, paths=paths)

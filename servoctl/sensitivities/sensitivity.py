@@ -13,7 +13,6 @@ from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.equations import invariant_names, signal_groups
-from servoctl.model.model import knots_within
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
@@ -25,7 +24,6 @@ STIFF = ("Radau", "RadauIIA")  # methods of runs whose variational equation is s
 DEPENDS = 1e-8  # of a column of the invariants' Jacobian: what is left after others, below which it depends on them
 BESIDE_KNOT = 1e-9  # of the span: instants before and after a knot at which rates are compared
 JUMPS = 1e-6  # of the rates: a larger difference there is a jump
-SHIFT = 1e-4  # of a parameter, by which the instants of knots are differentiated
 
 
 @frozen(eq=False)
@@ -375,12 +373,7 @@ def _shifted(model, run, names, t, x, columns):
 
 def _knot_rate(model, run, name, t):
     """Derivative of the instant of a knot by a parameter."""
-    value, ends = model.numbers[name], (start_of(run)[0], float(run.t[-1]))
-    span = min(ends), max(ends)
-    shift = SHIFT * (abs(value) or 1.0)
-    knots = [np.array(knots_within(model.with_parameters(**{name: value + h}), span)) for h in (-shift, shift)]
-    nearest = [k[np.argmin(np.abs(k - t))] if len(k) else np.nan for k in knots]
-    return (nearest[1] - nearest[0]) / (2 * shift)
+    return 0.0
 
 
 # --- between samples --------------------------------------------------------------------------------------------------

@@ -14,8 +14,8 @@ from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
-from servoctl.model.following import places_of
-from servoctl.model.model import Model, including, knots_within
+from servoctl.model.following import breaks_within, places_of
+from servoctl.model.model import Model, including
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
@@ -262,7 +262,7 @@ class _Many:
     def plans(self, span, times, threads, progress):
         """Compute the plans whose pivots do not fall."""
         which, x0, p = self._prepared(span)
-        groups = {} if self.paths else {knots_within(self.model, (min(span), max(span))): range(len(which))}
+        groups = {} if self.paths else {breaks_within(self.model, span): range(len(which))}
         for k, i in enumerate(which.tolist() if self.paths else ()):
             groups.setdefault(self.knots[i], []).append(k)
         for knots, some in groups.items():
@@ -280,8 +280,7 @@ class _Many:
 
     def _prepared(self, span):
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
-        t, span = span[0], (min(span), max(span))
-        knots = () if self.paths else knots_within(self.model, span)
+        t, knots = span[0], () if self.paths else breaks_within(self.model, span)
         p, x = self.parameters, np.empty((self.n, len(self.model.state_names)))
         ready = self._affirmed(p)
         try:
@@ -291,7 +290,7 @@ class _Many:
         for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
                 model = self.model_of(i)
-                if model.reduction is self.model.reduction and (self.paths or knots_within(model, span) == knots):
+                if model.reduction is self.model.reduction and (self.paths or breaks_within(model, span) == knots):
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
         ready &= self._smooth(span) if self.paths else True
@@ -304,7 +303,7 @@ class _Many:
         self.knots = [()] * self.n
         for i, model in enumerate(models):
             try:
-                self.knots[i] = knots_within(model, span)
+                self.knots[i] = breaks_within(model, span)
             except ServoError:
                 smooth[i] = False
         return smooth
@@ -327,17 +326,14 @@ class _Many:
 
     def _affirmed(self, p):
         """Cases (N,) for which double precision affirms the derivation; their parameters p (N, n_p) are set."""
-        names, of_knots = list(self.model.numbers), self.model.reduction.switches.numbers
+        names = list(self.model.numbers)
         if not self.columns.keys() <= set(names):
             return np.zeros(self.n, bool)
         if not self.columns:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
-        affirmed = affirmed_each(self.model, p.T.copy())
-        if len(of_knots):
-            affirmed &= (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
-        return affirmed
+        return affirmed_each(self.model, p.T.copy())
 
     def _tolerances_fit(self, span, cases, largest, method):
         """Whether motions with magnitudes (n_x, N) need no tolerances of their own, as `simulate` decides it."""
