@@ -48,8 +48,8 @@ from servoctl.methods.stability import run_checked, warn_drifted, warn_many_step
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
 from servoctl.model.equations import invariant_names
-from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.model.following import SMOOTHER, breaks_within
+from servoctl.model.jets import extended, jet_names_to, with_highest
 from servoctl.model.model import Model, including
 from servoctl.model.start import State
 from servoctl.model.switching import switching

@@ -124,7 +124,7 @@ class Series:
         if kind == "quad":
             return self._quadrature(node, k)
         if kind == "constant":
-            return apply(data, *(self._deciding(j) for j in args)) if k == 0 else 0.0
+            return apply(data, *(self.c[j][0] for j in args)) if k == 0 else 0.0
         a = c[args[0]]
         if kind == "neg":
             return 0.0 if is_zero(a[k]) else -a[k]

@@ -669,10 +669,10 @@ def _require_no_switch(expression, q, what):
     for switch in branches.switches:
         if not any(map(q.is_jet, ca.symvar(switch.function))):
             raise SpecificationError(
-                f"{what} switches with the time alone, where {switch.text}.",
+                f"{what[0].upper()}{what[1:]} switches with the time alone, where {switch.text}.",
                 "Formulas of q.t are smooth; a signal that switches is a path, which knows its instants.",
-                do="Write r = q.references(r=first.then(second)).r with paths of sv.paths in place of if_else(q.t < ..., "
-                "...), or sv.paths.polynomials(breaks, coefficients) in place of fmin and fmax.",
+                do="Write r = q.references(r=first.then(second)).r with paths of sv.paths in place of "
+                "if_else(q.t < ..., ...), or sv.paths.polynomials(breaks, coefficients) in place of fmin and fmax.",
                 what=what,
                 switch=switch.text,
             )
