@@ -329,6 +329,38 @@ class Model(Detailed):
         """States (n_x, points) at which ranks were decided, with the model's own parameters."""
         return points_with(self)
 
+    def feedforward(self, start: State, rate: float = 1000.0) -> "Feedforward":
+        """Forces along references that arrive in samples: `step = model.feedforward(start)`, then `step(jets)`.
+
+        For a controller's loop in real time, `export_c(model, folder, references="argument")` writes the same in C.
+
+        Parameters
+        ----------
+        start : State
+            Of the first sample, by `start`: along any path, or near the first jets if all of the motion follows.
+        rate : float, optional
+            Samples per second [Hz]; default 1000.
+
+        Returns
+        -------
+        Feedforward
+            Takes value and derivatives of each reference, `step({"X": (x, dx, ...)})`, and returns forces by name.
+
+        Raises
+        ------
+        SpecificationError
+            If the model follows no references, the start is none, or the rate is not positive.
+        """
+        from servoctl.streaming import Feedforward
+
+        if not self.paths:
+            raise SpecificationError(
+                "The model follows no references.",
+                "A feedforward takes the jets of references, sample by sample.",
+                do="Write the program with r = q.references(X=None), or simulate its plan.",
+            )
+        return Feedforward(self, start, rate)
+
     def start(
         self,
         /,
