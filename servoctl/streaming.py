@@ -39,6 +39,7 @@ class Feedforward:
 
     @property
     def t(self):
+        """Time of the next sample [s]."""
         return self._begin + self._count * self._period
 
     def __repr__(self):

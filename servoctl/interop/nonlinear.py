@@ -32,10 +32,10 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), references="path", n
     """A model, plant, law or closed loop as a `control.NonlinearIOSystem`.
 
     A model has no inputs, or those of its references: its states follow the program; its outputs are the states, the
-    required actuation (or reaction) and the mechanism's outputs. A plant's inputs are its actuators, its outputs the states and the
-    mechanism's outputs. A law is sampled (dt = 1/rate) from the measurement to the actuators. A closed loop is the
-    `control.interconnect` of its sampled plant and its law; its inputs are "disturbance NAME" of each generalised force
-    and "noise NAME" of each measured state, its outputs those of the plant and "command NAME".
+    required actuation (or reaction) and the mechanism's outputs. A plant's inputs are its actuators, its outputs the
+    states and the mechanism's outputs. A law is sampled (dt = 1/rate) from the measurement to the actuators. A closed
+    loop is the `control.interconnect` of its sampled plant and its law; its inputs are "disturbance NAME" of each
+    generalised force and "noise NAME" of each measured state, its outputs those of the plant and "command NAME".
 
     Parameters
     ----------

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -31,6 +32,9 @@ from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
 from servoctl.spec.references import other_paths, required_paths
 from servoctl.values import evenly, read_only
+
+if TYPE_CHECKING:
+    from servoctl.streaming import Feedforward
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 
