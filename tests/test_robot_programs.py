@@ -276,7 +276,7 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
         (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), 2.0 * np.eye(3)), "no rotation"),
         (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), np.diag([1, 1, -1])), "no rotation"),
         (lambda q: sv.rotations.turn(q["x"], (0, 0, 1), np.zeros((3, 3))), "no rotation"),
-        (lambda q: sv.rotations.spline(q.t, [], []), "rotation"),
+        (lambda q: sv.rotations.vectors([]), "rotation"),
         (lambda q: sv.programs.follow_point("p", (q["x"], q["y"]), (1,)), "2 entries with 1"),
         (lambda q: sv.programs.curvature("p", q, (q["x"], q["y"], 0), 1.0), "3 entries"),
         (lambda q: sv.programs.follow_path("p", (q["x"],), q["y"], q.t), "follow_point"),
@@ -310,22 +310,38 @@ def test_turns_and_slerps_are_rotations_at_an_even_rate():
     assert max(np.abs(r.T @ r - np.eye(3)).max() for r in values) < 1e-14
 
 
-def test_a_spline_passes_through_rotations():
-    t, times = ca.SX.sym("t"), [0.0, 1.0, 1.5, 3.0]
-    through = [np.array(ca.DM(ca.evalf(sv.rotations.turn(angle, (1, angle, 0.3))))) for angle in (0.1, 0.9, 1.4, -0.5)]
-    path = sv.rotations.spline(t, times, through, smoothness=3)
-    for value, wanted in zip(numbers_of(path, t, times), through, strict=True):
-        assert np.abs(value - wanted).max() < 1e-12
-    for value in numbers_of(path, t, np.linspace(-0.5, 3.5, 9)):
+def test_a_path_passes_through_measured_rotations():
+    """Rotations at given times, as three references about the middle one, and a body that is told to follow them."""
+    times, turns = [0.0, 1.0, 1.5, 3.0], [(0.1, 0.1), (0.9, 0.9), (1.4, 1.4), (-0.5, -0.5)]
+    through = [np.array(ca.DM(ca.evalf(sv.rotations.turn(angle, (1, x, 0.3))))) for angle, x in turns]
+    vectors, middle = sv.rotations.vectors(through)
+    path = sv.paths.spline(times, vectors, smoothness=3)
+    q = sv.coordinates("a b c")
+    r = q.references(rx=path[0], ry=path[1], rz=path[2])
+    rotation = middle @ sv.rotations.from_vector([*r])
+    at = ca.Function("at", [ca.vertcat(*r)], [rotation])
+    for t, wanted in zip(times, through, strict=True):
+        assert np.abs(np.array(at(path(t))) - wanted).max() < 1e-12
+    for t in np.linspace(-0.5, 3.5, 9):
+        value = np.array(at(path(t)))
         assert np.abs(value.T @ value - np.eye(3)).max() < 1e-13
-    vector = sv.rotations.vector(path)
-    assert np.abs(np.array(ca.evalf(ca.substitute(sv.rotations.from_vector(vector) - path, t, 0.4)))).max() < 1e-14
+        assert np.abs(np.array(ca.DM(sv.rotations.vector(middle.T @ value))).ravel() - path(t)).max() < 1e-13
+
+    axes = sv.rotations.turn(q["a"], (0, 0, 1)) @ sv.rotations.turn(q["b"], (0, 1, 0)) @ sv.rotations.turn(q["c"], (1, 0, 0))
+    body = sv.Mechanism(q, sv.rigid_body(q, 0.0, (1, 2, 3), rates=sv.body_rates(q, axes)), actuators=dict(zip("uvw", q, strict=True)))
+    model = sv.derive(body, sv.Program(sv.programs.orientation("turned", axes, rotation), by="actuators"))
+    run = sv.simulate(model, model.start(), (0.0, 3.0), t_eval=times)
+    followed = ca.Function("followed", [ca.vertcat(*q)], [axes])
+    for k, wanted in enumerate(through):
+        assert np.abs(np.array(followed([run[name][k] for name in "abc"])) - wanted).max() < 1e-10
 
 
 def test_rotations_refuse_half_turns_and_what_is_none():
     half = np.diag([1.0, -1.0, -1.0])
     with refused(sv.errors.SpecificationError, "half a turn"):
         sv.rotations.slerp(0.5, np.eye(3), half)
+    with refused(sv.errors.SpecificationError, "rotations[0]", "half a turn"):
+        sv.rotations.vectors([half, np.eye(3)])
     with refused(sv.errors.SpecificationError, "start"):
         sv.rotations.slerp(0.5, np.diag([1.0, 1.0, -1.0]), np.eye(3))
     with refused(sv.errors.SpecificationError, "axis", axis=[0, 0, 0]):
