@@ -362,9 +362,10 @@ def test_only_the_flat_point_of_the_vtol_is_flat(shift, free):
     assert float(ca.substitute(height, ca.vertcat(*p.symbols), p.values())) / (1 + shift) == pytest.approx(
         0.0433649377, abs=5e-11
     )
-    path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=4)
+    path = sv.paths.rest_to_rest((0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=4)
+    r = mechanism.q.references(across=path[0], up=path[1])
     point = ca.vertcat(x - height * ca.sin(theta), z + height * ca.cos(theta))
-    model = sv.derive(mechanism, sv.Program({"X": point[0] - path[0], "Z": point[1] - path[1]}))
+    model = sv.derive(mechanism, sv.Program({"X": point[0] - r.across, "Z": point[1] - r.up}))
     assert model.free == free
 
 
