@@ -422,7 +422,7 @@ def test_invariants_hold_at_every_level_of_a_start():
     model = derive(*overhead_crane())
     for t in (0.0, 1.7, 6.0, 9.0):
         state = model.start(t, guess={"l": 4.0})
-        values = model.function("invariants")(t, state.values, model.parameters)[: len(invariant_names(model))]
+        values = model.function("invariants")(t, state.values, model.p)[: len(invariant_names(model))]
         assert np.max(np.abs(values)) < 1e-10
         assert state.t == t and state.free == ()
 

@@ -47,8 +47,8 @@ def test_the_inverse_of_a_pendulum_that_stands_is_bounded_between_the_rests_of_i
             sv.simulate(model.with_parameters(**{name: value + h}), model.start(), (0.0, 1.0), "bounded", t_eval=t)["force"]
             for h in (1e-4, -1e-4)
         ]
-        slope = (forces[0] - forces[1]) / 2e-4
-        assert np.abs(by["force", name] - slope).max() < 1e-6 * np.abs(slope).max()
+        slope, inside = (forces[0] - forces[1]) / 2e-4, (t >= 0.0) & (t <= 1.0)  # outside they fade with the window
+        assert np.abs(by["force", name] - slope)[inside].max() < 1e-6 * np.abs(slope).max()
 
 
 def test_a_report_has_the_verdict_at_both_ends_of_the_path():

@@ -297,7 +297,7 @@ def arm_determinant(links, Gamma, q2):
     model = arm(links, Gamma)
     x = np.zeros(4)
     x[[model.state_names.index("q1"), model.state_names.index("q2")]] = np.pi / 2 - Gamma * q2, q2
-    return np.linalg.det(model.function("matrices")(10.0, x, model.parameters)[:4].reshape(2, 2))
+    return np.linalg.det(model.function("matrices")(10.0, x, model.p)[:4].reshape(2, 2))
 
 
 @pytest.mark.parametrize("links", LINKS)

@@ -27,7 +27,7 @@ def test_the_logarithm_of_steps_is_within_a_hundredth():
 def test_a_coefficient_that_vanishes_does_not_lengthen_the_step(order, speed, oscillator):
     """At the turning point of x'' = -x every odd coefficient vanishes, where it passes zero every even one."""
     f, x0 = series_loop(oscillator, order + 1), oscillator.start(x=1.0 - speed, dx=speed).values
-    log = f.taylor(0.0, x0, 10.0, np.append(oscillator.parameters, 5.0), 1e-8, 1e-8, 10_000)
+    log = f.taylor(0.0, x0, 10.0, np.append(oscillator.p, 5.0), 1e-8, 1e-8, 10_000)
     t, x = log[:, 0], log[:, 1]
     assert t[-1] == 10.0 and np.abs(x - (np.cos(t) * (1.0 - speed) + np.sin(t) * speed)).max() < 1e-6
     assert t[1] < 1.3 * np.diff(t)[1:-1].max()
@@ -286,7 +286,7 @@ def test_matrices_have_the_velocities_that_rows_determine(span):
     speed = lambda t, _: [2 / np.sqrt(1 + np.sin(0.4 * np.cos(t - span[0]) + t) ** 2)]  # noqa: E731
     exact = solve_ivp(speed, span, [0.0], rtol=1e-11, atol=1e-12)
     assert run["x"][-1] == pytest.approx(exact.y[0, -1], abs=1e-8)
-    f, p, state = series_loop(model, 8), np.append(model.parameters, 3.0), start.values
+    f, p, state = series_loop(model, 8), np.append(model.p, 3.0), start.values
     assert f.others, "no velocity is determined by rows"
     moved = state.copy()
     moved[f.sizes["nq"] :] += 0.1 * (1 - np.array(f.sizes["free"]))
