@@ -27,9 +27,9 @@ def place(robot, link, posture):
 def arm_plan(duration=2.0):
     """The six-axis arm along a line with a turn."""
     arm = sv.urdf(robots.file_of("six_axis_arm"))
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, duration)
+    s = arm.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration)).s
     position, rotation = place(arm, "tool", HOME)
-    line = sv.paths.line(s, position.ravel(), position.ravel() + [0.05, -0.15, -0.1])
+    line = sv.curves.line(s, position.ravel(), position.ravel() + [0.05, -0.15, -0.1])
     pose = sv.programs.pose("tool", arm.frame("tool"), line, sv.rotations.turn(0.6 * s, (0, 0, 1), rotation))
     mechanism = arm.mechanism()
     model = sv.derive(mechanism, sv.Program(pose))
@@ -41,8 +41,8 @@ def quadruped_plan():
     """The quadruped on four point feet moves its trunk."""
     robot = sv.urdf(robots.file_of("quadruped"), base="free")
     rows = sv.held(robot, {f"{leg}_foot": "position" for leg in LEGS}, STANDING)
-    s = sv.paths.rest_to_rest(robot.q.t, 0.0, 1.0, 1.2)
-    line, turn = sv.paths.line(s, (0, 0, 0.3), (0.03, 0.02, 0.26)), sv.rotations.turn(0.15 * s, (0, 0, 1))
+    s = robot.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 1.2)).s
+    line, turn = sv.curves.line(s, (0, 0, 0.3), (0.03, 0.02, 0.26)), sv.rotations.turn(0.15 * s, (0, 0, 1))
     mechanism = robot.mechanism(rows)
     model = sv.derive(mechanism, sv.Program(sv.programs.pose("trunk", robot.frame("trunk"), line, turn)))
     return robot, mechanism, model, sv.simulate(model, model.start(guess=STANDING | {"base_qw": 1.0}), (0.0, 1.2))
@@ -114,7 +114,7 @@ def test_a_four_bar_is_closed_in_its_plane():
     assert list(sv.loop(*ends, "position")) == ["loop_x", "loop_z"]
     assert list(sv.loop(*ends, "pose")) == ["loop_x", "loop_z", "loop_ry"]
     mechanism = arm.mechanism(sv.loop(*ends, "position"), actuators=("crank_joint",))
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, 2.0)
+    s = arm.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 2.0)).s
     model = sv.derive(mechanism, sv.Program({"crank": arm.q["crank_joint"] + 1.0 + 2.0 * s}))
     start = model.start(guess={"crank_joint": -1.0, "coupler_joint": 1.0, "rocker_joint": -1.2})
     run = sv.simulate(model, start, (0.0, 2.0))
@@ -148,8 +148,8 @@ def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
     ends = robot.frame("left_end"), robot.frame("right_end")
     mechanism = robot.mechanism(sv.loop(*ends, "position"), actuators=("left_motor", "right_motor"))
     home = {"left_motor": -2.2, "left_elbow": 1.2, "right_motor": -0.9, "right_elbow": -1.2}
-    s = sv.paths.rest_to_rest(robot.q.t, 0.0, 1.0, 1.5)
-    line = sv.paths.line(s, (0.0, 0.56), (0.08, 0.5))
+    s = robot.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 1.5)).s
+    line = sv.curves.line(s, (0.0, 0.56), (0.08, 0.5))
     point = ends[0].position[[0, 2]]
     model = sv.derive(mechanism, sv.Program({"X": point[0] - line[0], "Z": point[1] - line[1]}))
     run = sv.simulate(model, model.start(guess=home), (0.0, 1.5))

@@ -54,6 +54,7 @@ def require_class(name, path, needs, span, jumps):
             + ("." if jumps else ", or write Program(..., jumps=True) where forces may jump."),
             name=name,
             needs=needs,
+            has=class_,
             t=float(inside[0]),
         )
 
