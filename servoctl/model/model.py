@@ -121,10 +121,6 @@ class Model(Detailed):
         The rows of the motion.
     parameters : (n_p,) array
         Values of the parameters.
-    state_names : tuple of str
-        Names of the state X = (q, γ', ..., γ^(s̄-1)).
-    jet_names : tuple of str
-        Names of the jets Z = (X, γ^(s̄)).
     """
 
     def __init__(self, reduction, store, values=None, functions=None, variants=None, paths=None):
@@ -132,8 +128,6 @@ class Model(Detailed):
         self.paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
         self.reduction, self._store = reduction, store
         self.parameters = read_only(reduction.context.values.copy() if values is None else values)
-        self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
-        self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
         # Models that differ only in numbers share their functions.
         self._functions = {} if functions is None else functions
         self._variants = {None: self} if variants is None else variants  # with other pivots: one set for all of them
@@ -248,6 +242,16 @@ class Model(Detailed):
     def flat(self):
         """Whether the program determines the motion completely, without internal dynamics."""
         return self.free == 0
+
+    @cached_property
+    def state_names(self):
+        """Names of the state X = (q, γ', ..., γ^(s̄-1)), a tuple."""
+        return tuple(name for k in range(self.reduction.top) for name in self.reduction.mechanism.q.jet_names(k))
+
+    @cached_property
+    def jet_names(self):
+        """Names of the jets Z = (X, γ^(s̄)), a tuple."""
+        return (*self.state_names, *self.reduction.mechanism.q.jet_names(self.reduction.top))
 
     @property
     def n(self):

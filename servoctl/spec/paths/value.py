@@ -170,10 +170,12 @@ class Path(Value):
     def breaks_below(self, smooth, low, high):
         """Instants (N,) from `low` to `high` at which fewer than `smooth` derivatives are continuous."""
         breaks = self.breaks[self.classes < smooth]
+        if not breaks.size:
+            return breaks
         if self.before == "periodic":
             first, period = self.breaks[0], self.breaks[-1] - self.breaks[0]
             turns = np.arange(np.floor((low - first) / period), np.ceil((high - first) / period))
-            breaks = np.unique(breaks + period * turns[:, None]) if breaks.size else breaks
+            breaks = np.unique(breaks + period * turns[:, None])
         return breaks[(low <= breaks) & (breaks <= high)]
 
     def __len__(self):
