@@ -253,7 +253,7 @@ def test_functions_of_numpy_and_math_on_symbols_never_pass_in_silence(name, wher
             "residual": lambda: sv.Program({"east": value}).residuals["east"],
             "position": lambda: sv.particle(q, 1.0, value),
             "potential": lambda: sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), potential=value).potential,
-            "path": lambda: sv.paths.line(q.t, 0.0, value),
+            "path": lambda: sv.curves.line(q.t, 0.0, value),
         }[where]
         try:
             result = make()

@@ -56,7 +56,7 @@ SMOOTH = {  # a path, and its breaks at which steps end: those where a motion by
 def test_paths_of_the_needed_class_are_followed_from_break_to_break(name, two_cars):
     path, breaks = SMOOTH[name]
     run = moved(two_cars, path)
-    assert run.knots == pytest.approx([-1.0, *breaks, 9.0], abs=1e-12) and {*breaks} <= {*run.t}
+    assert run.knots == pytest.approx(breaks, abs=1e-12)
     d2x1, d4x1 = path.jets(run.t, 4)[[2, 4], 0]
     expected = 2.0 * (d4x1 + d2x1) + d2x1  # of x2 = x1 + x1'': f = 2 x2'' + x1''
     assert np.abs(run["f"] - expected).max() < 1e-9 * np.abs(expected).max() and sv.verify(run).passed
@@ -83,7 +83,7 @@ def test_paths_below_the_needed_class_are_refused_with_class_and_instant(name, t
     path, has, when = ROUGH[name]
     said = "a jump" if has < 0 else f"has C^{has}"
     with refused(SpecificationError, said, f"at t = {when:g} s", "smoothness=4", name="X", needs=4, has=has) as caught:
-        moved(two_cars, path, (-1.0, 120.0))
+        moved(two_cars, path, (-1.0, max(9.0, when + 5.0)))
     assert caught.value.details["t"] == pytest.approx(when, abs=1e-12)
 
 
@@ -122,7 +122,7 @@ def test_a_material_constraint_that_moves_is_judged_too():
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)), actuators={"a": x}, constraints=rail)
     model = sv.derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}), keep=["y"])
     run = sv.simulate(model, model.start(), (0.0, 4.0))
-    assert run.knots == pytest.approx([0.0, 1.0, 3.0, 4.0]) and sv.verify(run).passed
+    assert run.knots == pytest.approx([1.0, 3.0]) and sv.verify(run).passed
     with refused(SpecificationError, name="rail", needs=2, has=1, t=1.0):
         sv.simulate(model.with_references(rail=move(1, t_start=1.0)), model.start(), (0.0, 4.0))
 

@@ -277,3 +277,14 @@ def test_equal_mechanisms_that_travelled_keep_references_of_their_own():
         assert copy.reduction.mechanism.q.family.paths == model.reduction.mechanism.q.family.paths
         run, other = (sv.simulate(m, m.start(guess={"l": float(m.paths["Z"](0.0))}), (0.0, 6.0)) for m in (model, copy))
         same(other, run, 1e-12)
+
+
+def test_what_is_no_instant_has_no_jets(backend):
+    """As where a step fails: neither an error nor a number."""
+    q = sv.coordinates("x")
+    r = q.references(a=PATH[0])
+    f = compiled(function_of(q, r.names, "jets", q[0], ca.SX(0, 1), ca.vertcat(r.a, *r.d(2))), "jets", ("rk",))
+    paths, t = Followed([PATH[0]]), np.array([0.5, np.nan, 2.0, np.inf])
+    values = f.grid(np.tile(t, 64), np.zeros((1, 256)), np.array([paths.address]))[:2]
+    assert f.backend == backend and np.isnan(values[:, 1::4]).all()
+    assert np.abs(values[:, ::2][:, ::2] - np.tile(PATH[0].jets([0.5], 2)[[0, 2], 0], 64)).max() < 1e-13

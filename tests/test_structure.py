@@ -137,19 +137,19 @@ def test_the_structure_is_the_same_in_motion(name, gallery_model):
 
 
 def test_the_essential_order_is_the_class_that_a_path_needs():
-    for smoothness in (3, 4):
-        mechanism, _ = vtol()
-        p = mechanism.parameters
-        x, z, theta = mechanism.q
-        height = p.J * ca.sin(p.tilt) / (p.M * (p.l * ca.cos(p.tilt) + p.h * ca.sin(p.tilt)))
-        path = sv.paths.rest_to_rest((0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=smoothness)
-        r = mechanism.q.references(across=path[0], up=path[1])
-        program = sv.Program({"X": x - height * ca.sin(theta) - r.across, "Z": z + height * ca.cos(theta) - r.up})
-        if smoothness == 3:
-            with refused(sv.errors.SpecificationError, needs=4, has=3):
-                sv.derive(mechanism, program)
-        else:
-            assert sv.derive(mechanism, program).flat
+    mechanism, _ = vtol()
+    p = mechanism.parameters
+    x, z, theta = mechanism.q
+    height = p.J * ca.sin(p.tilt) / (p.M * (p.l * ca.cos(p.tilt) + p.h * ca.sin(p.tilt)))
+    paths = [sv.paths.rest_to_rest((0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=k) for k in (3, 4)]
+    r = mechanism.q.references(across=None, up=None)
+    program = sv.Program({"X": x - height * ca.sin(theta) - r.across, "Z": z + height * ca.cos(theta) - r.up})
+    model = sv.derive(mechanism, program)
+    assert model.flat
+    rough, smooth = (model.with_references(across=path[0], up=path[1]) for path in paths)
+    assert sv.simulate(smooth, smooth.start(), (0.0, 5.0)).success
+    with refused(sv.errors.SpecificationError, needs=4, has=3, t=4.0):
+        sv.simulate(rough, rough.start(), (0.0, 5.0))
 
 
 # units and margins ---------------------------------------------------------------------------------------------------

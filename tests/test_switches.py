@@ -594,7 +594,7 @@ def test_a_pulse_along_a_path_is_met_at_both_breaks(half):
         model, start = along(path)
         run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
         assert [run["y"][-1], run["dy"][-1]] == pytest.approx([2.0 - 1.00037, 1.0], abs=1e-6)
-        assert set(path.breaks) <= {*run.knots}
+        assert run.knots == tuple(path.breaks[1:-1])
 
 
 def along(path):
