@@ -142,6 +142,9 @@ class Path(Value):
         low, high = self.breaks[pieces], self.breaks[pieces + 1]
         result = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
         result[1:, held] = 0.0
+        for end, rule in ((0, self.before), (-1, self.after)):
+            if rule in ("hold", None) and self.classes[end] < np.inf:  # rounding there would determine directions
+                result[1 : int(self.classes[end]) + 1, (at == self.breaks[end]) & (t == at)] = 0.0
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
     def _require_known(self, t, order):
