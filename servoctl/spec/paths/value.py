@@ -140,11 +140,14 @@ class Path(Value):
         t = np.where(held, at.clip(first, last), t)
         pieces = (np.searchsorted(self.breaks, at, "right") - 1).clip(0, len(self.breaks) - 2)
         low, high = self.breaks[pieces], self.breaks[pieces + 1]
-        result = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
+        tau = ((t - low) + (t - high)) / (high - low)
+        result = taylor(self.coefficients, pieces, tau, order)
+        ends = np.abs(tau) == 1.0
+        if ends.any():  # where a path rests its derivatives are zero: rounding would determine directions
+            terms = taylor(np.abs(self.coefficients), pieces[ends], np.ones(ends.sum()), order)
+            rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
+            result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
         result[1:, held] = 0.0
-        for end, rule in ((0, self.before), (-1, self.after)):
-            if rule in ("hold", None) and self.classes[end] < np.inf:  # rounding there would determine directions
-                result[1 : int(self.classes[end]) + 1, (at == self.breaks[end]) & (t == at)] = 0.0
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
     def _require_known(self, t, order):
