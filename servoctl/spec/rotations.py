@@ -1,8 +1,8 @@
 """Paths of rotations: matrices R(s) from a body's axes to the world's, of the class of their argument.
 
-With a reference as the argument they are orientations to be programmed::
+With a time law from `servoctl.paths` as the argument they are orientations to be programmed::
 
-    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)).s
+    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
     rotation = sv.rotations.slerp(s, start, end)
 """
 
