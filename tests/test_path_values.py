@@ -622,3 +622,10 @@ def test_bad_input_is_refused_with_the_facts(make, facts, details):
 def test_an_unknown_spline_end_shows_the_nearest():
     with refused(NameUnknown, name="naturl", match="natural"):
         spline([0.0, 1.0], [0.0, 1.0], ends="naturl")
+
+
+def test_where_a_path_rests_its_derivatives_are_zero_to_the_last_bit():
+    there = rest_to_rest(0.0, 3**0.5, duration=4.0)
+    path = there.then(rest_to_rest(3**0.5, 12**0.5, duration=3.0))
+    jets = path.jets([0.0, 4.0, 7.0], 5)[:, 0]
+    assert not jets[1:5].any() and (jets[5] != 0.0).all() and jets[0].tolist() == [0.0, 3**0.5, 12**0.5]

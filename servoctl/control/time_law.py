@@ -98,7 +98,7 @@ def fastest(
     mechanism : Mechanism
     program : Program
         With `shape=True` its residuals are h(q) - p(t), or conditions that hold at any speed; they may follow the curve
-        p at any pace, such as `paths.line(q.t, ...)`.
+        p at any pace, such as `curves.line(q.t, ...)`.
     limits : dict of str to (float, float) or float
         Lower and upper limit of actuators, their rates ("dtrolley") and outputs by name; a number c is (-c, c), None
         leaves a side open.

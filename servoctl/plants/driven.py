@@ -14,7 +14,7 @@ def driven(plant, inputs=None, residuals=None):
     """The model of a plant under given inputs, within its limits of magnitude.
 
     A plant with lag, transport delay or limits of rate is refused. Inputs by actuator, 0 by default, are numbers,
-    expressions of `q.t` such as paths, or functions that give them of `q.t`; `residuals` are those of a program that
+    expressions of `q.t` or of references, or functions that give them of `q.t`; `residuals` are those of a program that
     the inputs realise approximately, which runs report. Free initial values are all states that the material
     constraints leave; outputs include the inputs.
     """
@@ -48,7 +48,7 @@ def _expression(name, value, t):
         raise SpecificationError(
             f"The input {name!r} is a function that takes no symbol ({type(error).__name__}).",
             "A function of an input is evaluated once, at q.t: by arithmetic and CasADi's functions.",
-            do="Lay sv.paths.spline(q.t, times, points) through samples, or use CasADi's functions.",
+            do="Use CasADi's functions; samples are q.references(u=sv.paths.spline(times, points)).u, a reference.",
             name=name,
         ) from error
     return settled(column(value, f"the input {name!r}", 1))[0]

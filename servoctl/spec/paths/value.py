@@ -140,7 +140,13 @@ class Path(Value):
         t = np.where(held, at.clip(first, last), t)
         pieces = (np.searchsorted(self.breaks, at, "right") - 1).clip(0, len(self.breaks) - 2)
         low, high = self.breaks[pieces], self.breaks[pieces + 1]
-        result = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
+        tau = ((t - low) + (t - high)) / (high - low)
+        result = taylor(self.coefficients, pieces, tau, order)
+        ends = np.abs(tau) == 1.0
+        if ends.any():  # where a path rests its derivatives are zero: rounding would determine directions
+            terms = taylor(np.abs(self.coefficients), pieces[ends], np.ones(ends.sum()), order)
+            rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
+            result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
         result[1:, held] = 0.0
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
