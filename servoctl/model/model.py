@@ -30,7 +30,7 @@ from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.spec.references import other_paths, required_paths
+from servoctl.spec.references import other_paths, paths_at, required_paths
 from servoctl.values import evenly, read_only
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
@@ -145,9 +145,10 @@ class Model(Detailed):
 
     def __init__(self, reduction, store, values=None, knots=None, functions=None, variants=None, paths=None):
         q = reduction.mechanism.q
-        self.paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
         self.reduction, self._store = reduction, store
         self.parameters = read_only(reduction.context.values.copy() if values is None else values)
+        paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
+        self.paths = paths_at(paths, reduction.mechanism.parameters, self.parameters)
         self._knots = reduction.knots if knots is None else knots
         self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
         self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
@@ -206,7 +207,7 @@ class Model(Detailed):
             require_positive(r.mechanism, replace(r.points, values=values))
             if not self._holds(values):
                 self._store.require_unchanged()
-                return self._of(r.mechanism, r.program, r.context.guess, None, values)
+                return self._of(r.mechanism, r.program, r.context.guess, None, values).with_references(**self.paths)
         knots = require_smooth(r.switches, values, r.smoothness)
         return Model(r, self._store, values, knots, self._functions, paths=self.paths)
 
@@ -239,6 +240,10 @@ class Model(Detailed):
     @cached_property
     def _followed(self):
         return Followed([path.held() for path in required_paths(self.paths).values()])
+
+    @cached_property
+    def _rates_followed(self):
+        return {}  # tables of the paths with derivatives by parameters, by the places of these
 
     @cached_property
     def p(self):

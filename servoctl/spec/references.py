@@ -9,6 +9,7 @@ import numpy as np
 from servoctl.checks import by_name, named, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, column_of
+from servoctl.spec.paths.parametric import ParametricPath, parameters_of, path_at
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import Path
 
@@ -86,12 +87,14 @@ class Family:
         return References(self, paths)
 
     def jet(self, name, k):
-        """The symbol of the k-th derivative."""
+        """The symbol of the k-th derivative of a reference, or of its derivative by a parameter: (name, parameter)."""
         if (name, k) not in self._symbols:
             with _lock:  # threads that derive from one mechanism share its symbols
                 if (name, k) not in self._symbols:
-                    symbol = ca.SX.sym(name if k == 0 else f"d{name}" if k == 1 else f"d{k}{name}")
-                    self._places[symbol.element_hash()] = ("r", k, self.names.index(name))
+                    written = name if isinstance(name, str) else "_by_".join(name)
+                    symbol = ca.SX.sym(written if k == 0 else f"d{written}" if k == 1 else f"d{k}{written}")
+                    place = self.names.index(name) if name in self.paths else name
+                    self._places[symbol.element_hash()] = ("r", k, place)
                     self._symbols[name, k] = symbol
         return self._symbols[name, k]
 
@@ -180,9 +183,25 @@ def other_paths(paths, changes):
     return paths | {name: followed_path(name, path) for name, path in changes.items()}
 
 
+def paths_at(paths, parameters, values):
+    """The paths by name with the values (n_p,) of parameters that they contain."""
+    written = {s.name(): float(value) for s, value in zip(parameters.symbols, values, strict=False)}
+    for name, path in paths.items():
+        if unknown_ones := [one for one in parameters_of(path) if one not in written]:
+            raise SpecificationError(
+                f"The path of the reference {name!r} contains {', '.join(unknown_ones)}.",
+                "A path contains numbers and parameters of the mechanism.",
+                nearest=f"Its parameters are {', '.join(written)}." if written else "",
+                do=f"Make the mechanism with parameters=sv.parameters({unknown_ones[0]}=..., ...).",
+                reference=name,
+                names=unknown_ones,
+            )
+    return {name: path_at(path, written) for name, path in paths.items()}
+
+
 def followed_path(name, path):
     """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
-    path = path if path is None or isinstance(path, Path) else as_path(path)
+    path = path if path is None or isinstance(path, (Path, ParametricPath)) else as_path(path)
     if path is not None and path.dim != 1:
         raise SpecificationError(
             f"The path of the reference {name!r} has {path.dim} components.",
