@@ -77,7 +77,7 @@ def p_with(model, parameters):
 def moved_by(model, names):
     """Pairs (reference, parameter) of the paths that contain some of the parameters, by their names."""
     written = _written(model)
-    return tuple((r, name) for r, path in model.paths.items() for name in names if written[name] in parameters_of(path))
+    return tuple((r, n) for r, path in model.paths.items() for n in names if written.get(n) in parameters_of(path))
 
 
 def p_with_rates(model, pairs):

@@ -135,16 +135,18 @@ def called(q, names, f, x, p):
 class Jets:
     """The jets of references in expressions as further numbers of a column, whose values follow from paths by name.
 
-    `places` are their names and orders, `symbols` and `rates`, the next jets, SX columns.
+    `places` are their names and orders, `symbols` and `rates`, the next jets, SX columns. `numbers` are parameters and
+    their values (n_p,), which paths may contain.
     """
 
-    def __init__(self, q, expressions, paths=None):
+    def __init__(self, q, expressions, paths=None, numbers=None):
         symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *map(ca.vec, expressions)))
         found = [(place, s) for s in symbols if (place := q.where(s)) and place[0] == "r"]
         self.symbols = ca.vertcat(ca.SX(0, 1), *(s for _, s in found))
         self._names, self.places = q.family.names, [(q.family.names[i], k) for (_, k, i), _ in found]
         self.rates = ca.vertcat(ca.SX(0, 1), *(q.family.jet(name, k + 1) for name, k in self.places))
-        self._paths = paths and required_paths({name: paths[name] for name, _ in self.places})
+        self.paths = paths and required_paths({name: paths[name] for name, _ in self.places})
+        self.paths = paths_at(self.paths, *numbers) if numbers else self.paths
 
     def __len__(self):
         return len(self.places)
@@ -161,7 +163,7 @@ class Jets:
     def at(self, t):
         """Their values at times (N,) [s], (n, N); a path that says nothing of an instant is held there."""
         highest = {name: k for k, name in sorted((k, name) for name, k in self.places)}
-        jets = {name: self._paths[name].held().jets(t, k) for name, k in highest.items()}
+        jets = {name: self.paths[name].held().jets(t, k) for name, k in highest.items()}
         return np.concatenate([np.zeros((0, len(t))), *(jets[name][k] for name, k in self.places)])
 
 
@@ -197,6 +199,20 @@ def paths_at(paths, parameters, values):
                 names=unknown_ones,
             )
     return {name: path_at(path, written) for name, path in paths.items()}
+
+
+def require_fixed(paths, parameters, names, what):
+    """Refuse parameters by name which paths contain where they are changed along the same paths by `what`."""
+    written = {s.name(): name for name, s in zip(parameters.names, parameters.symbols, strict=True) if name in names}
+    for reference, path in paths.items():
+        if both := [name for one, name in written.items() if one in parameters_of(path)]:
+            raise SpecificationError(
+                f"The path of the reference {reference!r} contains {', '.join(both)}.",
+                f"{what} parameters along paths that stay the same.",
+                do=f"Follow a path of numbers: with_references({reference}=path.at({both[0]}=...)).",
+                reference=reference,
+                names=both,
+            )
 
 
 def followed_path(name, path):

@@ -110,6 +110,7 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
     return _along(breaks, table, 0.0 * distance, distance, k, np.isin(breaks, corners))
 
 
+@or_parameters()
 def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     """Move from rest to rest along a line as quickly as limits of speed, acceleration and jerk allow.
 
@@ -238,6 +239,7 @@ def _interpolating(times, points, vanishing, outside):
     return Path(breaks, coefficients, classes, outside, outside)
 
 
+@or_parameters()
 def polynomials(breaks, coefficients, *, smoothness=None, before=None, after=None):
     """Piecewise polynomials in the convention of SciPy's `PPoly`.
 

@@ -26,7 +26,8 @@ MAKERS = {}  # by name
 def or_parameters(*numbers, times=None):
     """The decorator of a maker of paths which makes a `ParametricPath` where some of its numbers are expressions.
 
-    `numbers` are the names of its arguments that may be, the first one that of a point, or of points at `times`.
+    `numbers` are the names of its arguments that may be, the first one that of a point, or of points at `times`; in
+    others expressions are refused.
     """
 
     def decorator(make):
@@ -35,7 +36,10 @@ def or_parameters(*numbers, times=None):
         @functools.wraps(make)
         def either(*args, **kwargs):
             given = inspect.signature(make).bind(*args, **kwargs)
-            if not any(varies(given.arguments.get(name)) for name in numbers):
+            varied = [name for name, value in given.arguments.items() if varies(value)]
+            if others := set(varied) - {*numbers}:
+                _refuse(make.__name__, sorted(others), numbers)
+            if not varied:
                 return make(*args, **kwargs)
             given.apply_defaults()
             options = {name: value for name, value in given.arguments.items() if name not in numbers}
@@ -46,6 +50,17 @@ def or_parameters(*numbers, times=None):
         return either
 
     return decorator
+
+
+def _refuse(maker, names, numbers):
+    """Refuse expressions where a maker of paths takes numbers alone."""
+    takes = f"in place of {', '.join(numbers)}" if numbers else "by rest_to_rest, trapezoid and spline"
+    raise SpecificationError(
+        f"There are expressions in {' and '.join(names)} of sv.paths.{maker.removesuffix('_through')}.",
+        f"Parameters are taken {takes}; a path of numbers is added to and multiplied by them.",
+        do="Write numbers, or path * p.a + p.b and path.at_rate(p.c).",
+        names=tuple(names),
+    )
 
 
 def _entries(value):
@@ -154,7 +169,8 @@ class ParametricPath(Value):
         ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes.values()])[:-1]
         parts = np.split(np.vstack([values.T, *slopes]), ends, axis=1)
         parts = {n: part.reshape(-1, *shape) for (n, shape), part in zip(self.shapes.items(), parts, strict=True)}
-        return {n: part[0] for n, part in parts.items()}, {n: part[1:] for n, part in parts.items()}
+        given = {n: part[0] if self.shapes[n] else float(part[0]) for n, part in parts.items()}
+        return given, {n: part[1:] for n, part in parts.items()}
 
     def made(self, numbers):
         """The path with numbers of the parameters by name, among others."""
