@@ -200,18 +200,18 @@ class ParametricPath(Value):
         table = coefficients - middle[:, :, None, None] * slopes
         table -= longer[:, :, None, None] * path.coefficients * powers
         moves = (breaks != 0) & np.isfinite(path.classes)
-        self._require_known(path, moves.any(axis=0))
-        sides = path.before, path.after
-        return [Path(path.breaks, c, path.classes - move, *sides) for c, move in zip(table, moves, strict=True)]
+        self._require_known_outside(path, moves.any(axis=0))
+        classes, sides = np.maximum(path.classes - moves, -1.0), (path.before, path.after)
+        return [Path(path.breaks, c, rough, *sides) for c, rough in zip(table, classes, strict=True)]
 
-    def _require_known(self, path, moves):
-        """Refuse a path that has no derivative where its breaks move."""
-        rough = path.breaks[moves & (path.classes < 1)]
-        if len(rough) or path.before == "periodic" and moves.any():
-            what = f"of class C^0 or less at t = {rough[0]:g} s" if len(rough) else "periodic"
+    def _require_known_outside(self, path, moves):
+        """Refuse a path whose derivative is not held, or does not repeat, outside its breaks where these move."""
+        bent = path.breaks[[0, -1]][moves[[0, -1]] & (path.classes[[0, -1]] < 1)]
+        if len(bent) or path.before == "periodic" and moves.any():
+            what = f"has a bend where it is held, at t = {bent[0]:g} s" if len(bent) else "is periodic"
             raise SpecificationError(
-                f"The path is {what}, and its breaks move with {', '.join(self.names)}.",
-                "Derivatives by a parameter are those of paths of class C^1 where breaks move, which do not repeat.",
+                f"The path {what}, and its breaks move with {', '.join(self.names)}.",
+                "A path has derivatives by parameters where it comes to rest before it is held, and does not repeat.",
                 do="Make it with smoothness=1 or more, without before='periodic'; or keep its breaks where they are.",
                 names=self.names,
             )
