@@ -9,7 +9,7 @@ from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.model.points import with_place
-from servoctl.spec.paths.parametric import parameters_of
+from servoctl.spec.paths.parametric import parameters_of, path_moved
 from servoctl.spec.paths.value import SAME
 from servoctl.spec.references import required_paths
 
@@ -86,22 +86,27 @@ def p_with_rates(model, pairs):
         return model.p
     known = model._rates_followed
     if pairs not in known:
-        rates = [model.paths[r].source.rates(_numbers(model), [_written(model)[name]])[0].held() for r, name in pairs]
-        known[pairs] = Followed([*model._followed.paths, *rates])
+        rates = []
+        for reference in dict.fromkeys(r for r, _ in pairs):  # pairs are in their order
+            of = [_written(model)[name] for r, name in pairs if r == reference]
+            rates += model.paths[reference].source.rates(_numbers(model), of)
+        known[pairs] = Followed([*model._followed.paths, *(rate.held() for rate in rates)])
     return with_place((known[pairs].address,), model.parameters)
 
 
 def instant_by(model, name, t):
-    """The derivative by a parameter of an instant t [s] at which paths have a break; None where none has.
+    """The derivative by a parameter of an instant t [s] at which paths may make forces jump; None where none does.
 
     SpecificationError where breaks of several paths meet that move differently.
     """
     rates = {}
     for reference, path in model.paths.items():
         k = int(np.argmin(np.abs(path.breaks - t)))
-        if path.classes[k] < model.reduction.follows[reference] and abs(path.breaks[k] - t) <= SAME * abs(t):
+        if path.classes[k] <= model.reduction.follows[reference] and abs(path.breaks[k] - t) <= SAME * abs(t):
             moves = _written(model)[name] in parameters_of(path)
-            rates[reference] = path.source.moved(_numbers(model), [_written(model)[name]])[1][0, k] if moves else 0.0
+            rates[reference] = (
+                path_moved(path.source, _numbers(model), [_written(model)[name]])[1][0, k] if moves else 0.0
+            )
     if len({*rates.values()}) > 1:
         raise SpecificationError(
             f"At t = {t:.6g} s the paths of {', '.join(rates)} have breaks that move differently with {name!r}.",

@@ -195,7 +195,7 @@ def paths_at(paths, parameters, values):
                 "A path contains numbers and parameters of the mechanism.",
                 nearest=f"Its parameters are {', '.join(written)}." if written else "",
                 do=f"Make the mechanism with parameters=sv.parameters({unknown_ones[0]}=..., ...).",
-                reference=name,
+                name=name,
                 names=unknown_ones,
             )
     return {name: path_at(path, written) for name, path in paths.items()}
@@ -210,7 +210,7 @@ def require_fixed(paths, parameters, names, what):
                 f"The path of the reference {reference!r} contains {', '.join(both)}.",
                 f"{what} parameters along paths that stay the same.",
                 do=f"Follow a path of numbers: with_references({reference}=path.at({both[0]}=...)).",
-                reference=reference,
+                name=reference,
                 names=both,
             )
 

@@ -89,7 +89,7 @@ def _parametric(maker, entries, options, dim):
             do="Take all of them from one sv.parameters(...).",
             names=tuple(s.name() for s in symbols),
         )
-    for name in base.names if isinstance(base, ParametricPath) else ():
+    for name in parameters_of(base):
         known.setdefault(name, ca.SX.sym(name))
     p = ca.vertcat(*known.values())
     f = ca.Function("numbers", [p], [ca.densify(column), ca.densify(ca.jacobian(column, p))])
@@ -113,18 +113,18 @@ class ParametricPath(Value):
     options : dict
         Its other arguments.
     names : tuple of str
-        Of the parameters.
+        Of its parameters.
     content : str
-        The function from parameters to numbers and their derivatives, serialised.
+        The function of these that returns its numbers, and their derivatives, serialised.
     dim : int
         The number of components.
     """
 
     maker: str
-    shapes: dict = field(repr=False)
+    shapes: dict
     options: dict
     names: tuple
-    content: str = field(repr=False)
+    content: str
     dim: int
     __array_ufunc__ = None  # as of `Path`
 
@@ -174,25 +174,12 @@ class ParametricPath(Value):
 
     def made(self, numbers):
         """The path with numbers of the parameters by name, among others."""
-        given, _ = self._given(numbers)
-        base = self.options.get("base")
-        known = {"base": base.made(numbers)} if isinstance(base, ParametricPath) else {}
-        return MAKERS[self.maker](**given, **self.options | known)
-
-    def moved(self, numbers, directions):
-        """The path with numbers, and derivatives of its breaks (K, n + 1) and of its coefficients (K, n, dim, size)."""
-        path, (given, rates) = self.made(numbers), self._given(numbers, directions)
-        base = self.options.get("base")
-        if base is None:
-            return path, *RATES[self.maker](path, given, rates, self.options)
-        if not isinstance(base, ParametricPath):
-            shapes = ((len(directions), *part.shape) for part in (base.breaks, base.coefficients))
-            return path, *_changed_rates((base, *map(np.zeros, shapes)), given, rates, self.options)
-        return path, *_changed_rates(base.moved(numbers, directions), given, rates, self.options)
+        options = {name: path_at(one, numbers) if name == "base" else one for name, one in self.options.items()}
+        return MAKERS[self.maker](**self._given(numbers)[0], **options)
 
     def rates(self, numbers, directions):
         """The derivatives of the path by some of the parameters, a list of `Path`."""
-        path, breaks, coefficients = self.moved(numbers, directions)
+        path, breaks, coefficients = path_moved(self, numbers, directions)
         half = np.diff(path.breaks) / 2
         middle, longer = (breaks[:, 1:] + breaks[:, :-1]) / 2 / half, np.diff(breaks) / 2 / half
         powers = np.arange(coefficients.shape[-1])
@@ -263,9 +250,7 @@ class ParametricPath(Value):
         )
 
     def __repr__(self):
-        made = self.options.get("base", self.maker)
-        text = f"from {made}" if isinstance(made, str) else "from another path"
-        return f"Path: {self.dim} component{'s' * (self.dim > 1)} {text}, with the parameters {', '.join(self.names)}"
+        return f"Path: {self.dim} component{'s' * (self.dim > 1)}, with the parameters {', '.join(self.names)}"
 
 
 @frozen(eq=False, repr=False)
@@ -293,7 +278,16 @@ def parameters_of(path):
     return path.names if isinstance(path, ParametricPath) else path.source.names if isinstance(path, PathAt) else ()
 
 
-# --- derivatives of the breaks (K, n + 1) and of the coefficients (K, n, dim, size), by maker -------------------------
+# --- derivatives of the breaks and of the coefficients, by maker ------------------------------------------------------
+
+
+def path_moved(path, numbers, directions):
+    """A path with numbers, and derivatives of its breaks (K, n + 1) and of its coefficients (K, n, dim, size)."""
+    if not isinstance(path, ParametricPath):
+        return path, *(np.zeros((len(directions), *part.shape)) for part in (path.breaks, path.coefficients))
+    options = {n: path_moved(one, numbers, directions) if n == "base" else one for n, one in path.options.items()}
+    made = path.made(numbers)
+    return made, *RATES[path.maker](made, *path._given(numbers, directions), options)
 
 
 def _rest_to_rest_rates(path, given, rates, options):
@@ -327,7 +321,7 @@ def _trapezoid_rates(path, given, rates, options):
     rest[middles > corners[2], :, 0] = 1.0
     rest[(corners[1] < middles) & (middles < corners[2]), :, :2] = 0.5
     by_part = (by_ramp * duration - ramp * by_duration) / (duration - ramp) ** 2
-    K, distance = len(by_ramp), given["distance"].reshape(path.dim, 1)
+    K, distance = len(by_ramp), np.reshape(given["distance"], (path.dim, 1))
     coefficients = rates["distance"].reshape(K, 1, path.dim, 1) * unit
     coefficients = coefficients + by_part[:, None, None, None] * distance * (unit - rest) / part
     return np.array([np.interp(path.breaks, corners, move) for move in moves]), coefficients
@@ -375,9 +369,9 @@ def _changed(base, component, scale, offset, factor, about):
     return (path * scale + offset).at_rate(factor, about)
 
 
-def _changed_rates(base, given, rates, options):
-    """Of the path that is changed, from it with its own derivatives."""
-    path, moves, table = base
+def _changed_rates(_, given, rates, options):
+    """From those of the path that is changed."""
+    path, moves, table = options["base"]
     some = slice(None) if options["component"] is None else [options["component"]]
     coefficients = given["scale"] * table[:, :, some]
     coefficients += rates["scale"][:, None, None, None] * path.coefficients[:, some]
@@ -388,12 +382,18 @@ def _changed_rates(base, given, rates, options):
 
 
 MAKERS["changed"] = _changed
-RATES = {"rest_to_rest": _rest_to_rest_rates, "trapezoid": _trapezoid_rates, "spline_through": _spline_rates}
+RATES = {
+    "rest_to_rest": _rest_to_rest_rates,
+    "trapezoid": _trapezoid_rates,
+    "spline_through": _spline_rates,
+    "changed": _changed_rates,
+}
 
 
-def changed(base, component=None, scale=1.0, offset=0.0, factor=1.0, about=0.0):
-    """One component of a path, or all, times a number and plus another, along another clock."""
-    numbers = {"scale": scale, "offset": offset, "factor": factor, "about": about}
+def changed(base, component=None, scale=1.0, offset=None, factor=1.0, about=0.0):
+    """One component of a path, or all, times a number and plus a constant, along another clock."""
+    dim = base.dim if component is None else 1
+    numbers = {"scale": scale, "offset": np.zeros(dim) if offset is None else offset, "factor": factor, "about": about}
     for one in numbers.values():
         if isinstance(one, (Path, ParametricPath)):
             raise SpecificationError(
@@ -402,5 +402,5 @@ def changed(base, component=None, scale=1.0, offset=0.0, factor=1.0, about=0.0):
                 do="Name a reference for each path, q.references(a=..., b=...), and write r.a + r.b.",
             )
     entries = {name: _entries(value) for name, value in numbers.items()}
-    options = {"base": base, "component": component}
-    return _parametric("changed", entries, options, base.dim if component is None else 1)
+    base = base._with() if isinstance(base, PathAt) else base  # a path of numbers
+    return _parametric("changed", entries, {"base": base, "component": component}, dim)

@@ -17,8 +17,8 @@ def or_expression(old) -> Any:
     def decorator(new):
         @functools.wraps(new)
         def either(*args, **kwargs):
-            fits = _binds(new, args, kwargs) and not _binds(old, args, kwargs)
-            return (new if fits or not args or not isinstance(args[0], ca.SX) else old)(*args, **kwargs)
+            timed = args and isinstance(args[0], ca.SX) and _binds(old, args, kwargs)
+            return (new if _binds(new, args, kwargs) and not timed else old)(*args, **kwargs)
 
         return either
 
