@@ -24,6 +24,7 @@ from servoctl.model.following import p_with
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
 from servoctl.reduction.reduce import require_outputs
+from servoctl.spec.references import require_fixed
 
 SUBSTEPS = 10  # Runge-Kutta steps per sample: 1 ms at 100 Hz
 
@@ -114,6 +115,7 @@ def _model(model, name, as_inputs):
     inputs, at = _along_inputs(model, (ode, *(f for _, f in groups))) if as_inputs else ([], _along_paths(model))
 
     def rates(t, x, u, params):
+        _require_fixed_in(model, model.reduction.mechanism, p, params)
         y = at(ode, t, x, u, _parameter_values(p, symbols, params))[:n_x]
         if not np.isfinite(y).all():
             raise ServoError(
@@ -157,6 +159,14 @@ def _along_inputs(model, functions):
     return [jet(name, k).name() for k in range(count) for name in followed], at
 
 
+def _require_fixed_in(thing, mechanism, p, params):
+    """Refuse python-control's params by which the paths of a model or a plant would be others."""
+    if thing.paths:
+        own = zip(mechanism.parameters.names, p, strict=False)
+        changes = [name for name, value in own if params[name] != value]
+        require_fixed(thing.paths, mechanism.parameters, changes, "python-control changes")
+
+
 def _parameter_values(p, symbols, params):
     """The parameters p with the values of python-control's params."""
     return np.append([params[name] for name in symbols], p[len(symbols) :])
@@ -175,6 +185,7 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
     ode, low_high = plant.function("ode"), limits(plant, 1.0)[:2]
 
     def numbers(u, params):
+        _require_fixed_in(plant, plant.mechanism, plant.parameters, params)
         applied, calm = np.clip(u[:m], *low_high), np.zeros(len(plant.disturbable))
         p = np.concatenate([plant.place, _parameter_values(plant.parameters, symbols, params), applied, calm])
         p[places] = u[m:]

@@ -30,7 +30,7 @@ from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.spec.references import other_paths, required_paths
+from servoctl.spec.references import other_paths, paths_at, required_paths
 from servoctl.values import evenly, read_only
 
 if TYPE_CHECKING:
@@ -125,9 +125,10 @@ class Model(Detailed):
 
     def __init__(self, reduction, store, values=None, functions=None, variants=None, paths=None):
         q = reduction.mechanism.q
-        self.paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
         self.reduction, self._store = reduction, store
         self.parameters = read_only(reduction.context.values.copy() if values is None else values)
+        paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
+        self.paths = paths_at(paths, reduction.mechanism.parameters, self.parameters)
         # Models that differ only in numbers share their functions.
         self._functions = {} if functions is None else functions
         self._variants = {None: self} if variants is None else variants  # with other pivots: one set for all of them
@@ -182,7 +183,7 @@ class Model(Detailed):
             require_positive(r.mechanism, replace(r.points, values=values))
             if not self._holds(values):
                 self._store.require_unchanged()
-                return self._of(r.mechanism, r.program, r.context.guess, None, values)
+                return self._of(r.mechanism, r.program, r.context.guess, None, values).with_references(**self.paths)
         return Model(r, self._store, values, self._functions, paths=self.paths)
 
     def with_references(self, **paths) -> "Model":
@@ -214,6 +215,10 @@ class Model(Detailed):
     @cached_property
     def _followed(self):
         return Followed([path.held() for path in required_paths(self.paths).values()])
+
+    @cached_property
+    def _rates_followed(self):
+        return {}  # tables of the paths with derivatives by parameters, by the places of these
 
     @cached_property
     def p(self):

@@ -13,6 +13,7 @@ from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.equations import invariant_names, signal_groups
+from servoctl.model.following import instant_by, moved_by, p_with_rates
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
@@ -225,9 +226,10 @@ def _tangents(run, S, names, initial, kinds):
     """Tangents (rows, K, N) of jets and signals at the samples, from those S (n_x, K, N) of the state."""
     parts, K = [], len(names) + len(initial)
     for first, end, model in run.variants or ((0, len(run.t), run.model),):
-        f, t = tangent_at(model, names, len(initial), kinds), run.t[first:end]
+        moved, t = moved_by(model, names), run.t[first:end]
+        f, p = tangent_at(model, names, moved, len(initial), kinds), p_with_rates(model, moved)
         of_state = S[:, :, first:end].swapaxes(0, 1).reshape(-1, len(t))
-        y = f.grid(t, np.concatenate([run.jets[: len(model.jet_names), first:end], of_state]), model.p)
+        y = f.grid(t, np.concatenate([run.jets[: len(model.jet_names), first:end], of_state]), p)
         sizes = [len(model.jet_names), *(len(model.signals(kind)[0]) for kind in kinds)]
         blocks = zip(np.split(y, np.cumsum(sizes[:-1]) * K), sizes, strict=True)
         parts.append(np.concatenate([block.reshape(K, size, -1).swapaxes(0, 1) for block, size in blocks]))
@@ -254,7 +256,8 @@ def _tangent_at_start(run, names, initial):
     model = run.variant(0)
     t, x = start_of(run)
     m, n_x = len(invariant_names(model)), len(x)
-    y = invariants_by(model, names)(t, x, model.p)
+    moved = moved_by(model, names)
+    y = invariants_by(model, names, moved)(t, x, p_with_rates(model, moved))
     G = y[m:].reshape(n_x + len(names), m).T
     G, by_parameters = G[:, :n_x], G[:, n_x:]
     held = run.start.held if run.start is not None else ()
@@ -315,10 +318,11 @@ def _integrated(model, run, names, S):
         if k:
             y[n_x:] += _shifted(model, run, names, a, y[:n_x], K).T.ravel()
         variant = _variant_at(run, a, b)
-        f = variational(variant, names, K - len(names))
+        moved = moved_by(variant, names)
+        f, p = variational(variant, names, moved, K - len(names)), p_with_rates(variant, moved)
         inside = np.flatnonzero((forward * run.t >= forward * a) & (forward * run.t <= forward * b))
         solved = solve_ivp(
-            lambda t, z, f=f, p=variant.p: f(t, z, p),
+            lambda t, z, f=f, p=p: f(t, z, p),
             (a, b),
             y,
             method,
@@ -373,7 +377,7 @@ def _shifted(model, run, names, t, x, columns):
 
 def _knot_rate(model, run, name, t):
     """Derivative of the instant of a knot by a parameter."""
-    return 0.0
+    return instant_by(model, name, t) or 0.0
 
 
 # --- between samples --------------------------------------------------------------------------------------------------

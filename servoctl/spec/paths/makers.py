@@ -9,12 +9,14 @@ import numpy as np
 from servoctl.checks import array_of, as_numbers, finite, named, positive, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.spec.paths import expressions
+from servoctl.spec.paths.parametric import or_parameters
 from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
 from servoctl.spec.paths.transition import or_expression
 from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, vector
 
 
 @or_expression(expressions.rest_to_rest)
+@or_parameters("start", "end", "duration", "t_start")
 def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
     """Move from rest to rest along the polynomial of degree 2k + 1 whose first k derivatives vanish at both ends.
 
@@ -51,6 +53,7 @@ def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
 
 
 @or_expression(expressions.trapezoid)
+@or_parameters("distance", "duration", "ramp", "t_start")
 def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
     """Cover a distance at a constant speed that is reached, and left, along smooth ramps.
 
@@ -107,6 +110,7 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
     return _along(breaks, table, 0.0 * distance, distance, k, np.isin(breaks, corners))
 
 
+@or_parameters()
 def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     """Move from rest to rest along a line as quickly as limits of speed, acceleration and jerk allow.
 
@@ -153,6 +157,7 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
 
 
 @or_expression(expressions.spline)
+@or_parameters("points", "times", times="times")
 def spline_through(times, points, *, smoothness=2, ends="rest"):
     """Pass through points at given times along SciPy's interpolating spline.
 
@@ -234,6 +239,7 @@ def _interpolating(times, points, vanishing, outside):
     return Path(breaks, coefficients, classes, outside, outside)
 
 
+@or_parameters()
 def polynomials(breaks, coefficients, *, smoothness=None, before=None, after=None):
     """Piecewise polynomials in the convention of SciPy's `PPoly`.
 

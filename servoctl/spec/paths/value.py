@@ -2,6 +2,7 @@
 
 from dataclasses import field
 
+import casadi as ca
 import numpy as np
 
 from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
@@ -203,6 +204,8 @@ class Path(Value):
         return Path, (self.breaks, self.coefficients, self.classes, self.before, self.after, self.remark)
 
     def __mul__(self, factor):
+        if varies(factor):
+            return parametric().changed(self, scale=factor)
         return self._with(coefficients=self.coefficients * finite("factor", factor, "multiple of a path"))
 
     __rmul__ = __mul__
@@ -212,6 +215,8 @@ class Path(Value):
 
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
+        if varies(other):
+            return parametric().changed(self, offset=other)
         if not isinstance(other, Path):
             constant = vector("The constant added to a path", other)
             _require_dim(self.dim, len(constant))
@@ -225,6 +230,8 @@ class Path(Value):
     __radd__ = __add__
 
     def __sub__(self, other):
+        if varies(other):
+            return -(-self + other)
         return self + (-other if isinstance(other, Path) else -vector("The constant taken from a path", other))
 
     def __rsub__(self, other):
@@ -275,6 +282,8 @@ class Path(Value):
         -------
         Path
         """
+        if varies([factor, about]):
+            return parametric().changed(self, factor=factor, about=self.breaks[0] if about is None else about)
         fixed = self.breaks[0] if about is None else finite("about", about, "instant")
         return self._with(breaks=fixed + (self.breaks - fixed) / positive("factor", factor))
 
@@ -310,6 +319,20 @@ class Path(Value):
         ends = ", ".join(f"{side}: {does[rule]}" + f" (class {c:g})" * bool(c < np.inf) for side, rule, c in sides)
         text = f"{span}, degree {self.coefficients.shape[2] - 1}{between}\n  {ends}"
         return text + f"\n  {self.remark}" * bool(self.remark)
+
+
+def varies(value):
+    """Whether what stands in place of a number is an expression of parameters, or contains one."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and any(map(varies, value.ravel()))
+    return any(map(varies, value)) if isinstance(value, (list, tuple)) else isinstance(value, ca.SX)
+
+
+def parametric():
+    """The module of paths with parameters, which are made of these."""
+    from servoctl.spec.paths import parametric
+
+    return parametric
 
 
 def _require_dim(dim, other):
