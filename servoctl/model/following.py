@@ -9,7 +9,7 @@ from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.model.points import with_place
-from servoctl.spec.paths.parametric import parameters_of, path_moved
+from servoctl.spec.paths.parametric import parameters_of
 from servoctl.spec.paths.value import SAME
 from servoctl.spec.references import required_paths
 
@@ -98,14 +98,12 @@ def instant_by(model, name, t):
 
     SpecificationError where breaks of several paths meet that move differently.
     """
-    rates = {}
+    rates, written = {}, _written(model)[name]
     for reference, path in model.paths.items():
         k = int(np.argmin(np.abs(path.breaks - t)))
         if path.classes[k] <= model.reduction.follows[reference] and abs(path.breaks[k] - t) <= SAME * abs(t):
-            moves = _written(model)[name] in parameters_of(path)
-            rates[reference] = (
-                path_moved(path.source, _numbers(model), [_written(model)[name]])[1][0, k] if moves else 0.0
-            )
+            moves = written in parameters_of(path)
+            rates[reference] = path.source.moved(_numbers(model), written)[k] if moves else 0.0
     if len({*rates.values()}) > 1:
         raise SpecificationError(
             f"At t = {t:.6g} s the paths of {', '.join(rates)} have breaks that move differently with {name!r}.",

@@ -371,13 +371,8 @@ def _shifted(model, run, names, t, x, columns):
     jump = np.zeros((len(x), columns))
     if np.abs(after - before).max() > JUMPS * np.abs(sides).max():
         for j, name in enumerate(names):
-            jump[:, j] = (before - after) * _knot_rate(model, run, name, t)
+            jump[:, j] = (before - after) * (instant_by(model, name, t) or 0.0)
     return jump
-
-
-def _knot_rate(model, run, name, t):
-    """Derivative of the instant of a knot by a parameter."""
-    return instant_by(model, name, t) or 0.0
 
 
 # --- between samples --------------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ import numpy as np
 from servoctl.checks import MOST_JETS, array_of, as_numbers, as_span, positive, positives, require_kind, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.spec.paths.makers import hermite, samples
-from servoctl.spec.paths.parametric import or_parameters
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import SAME, Path, counted, stacked
 
@@ -19,7 +18,6 @@ FITPACK = 5  # the highest degree of its splines
 BOOLE = np.array([7.0, 32.0, 12.0, 32.0, 7.0]) / 90  # weights of a quadrature by five equidistant points
 
 
-@or_parameters()
 def function(f, span, smoothness=4, tolerance=1e-9, *, before=None, after=None):
     """The path of a function that is known with its derivatives, by polynomials that have these at both ends.
 
@@ -140,7 +138,6 @@ def _refuse(jets, ends, best):
     )
 
 
-@or_parameters()
 def fit(t, x, smoothness=4, *, tolerance):
     """The spline of class C^k with few knots that passes near noisy samples.
 

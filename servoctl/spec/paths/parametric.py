@@ -1,4 +1,4 @@
-"""Paths with parameters: their numbers are expressions, of which a model has the values.
+"""Paths with parameters: r(t) = A P((t - t0)/T) + b of a path P of numbers, where A, b, t0 and T are expressions.
 
 On each piece r = sum c_j(p) tau^j, where tau = (t - m(p))/h(p) goes from -1 to 1. Its derivative by a parameter,
 
@@ -7,94 +7,16 @@ On each piece r = sum c_j(p) tau^j, where tau = (t - m(p))/h(p) goes from -1 to 
 is a polynomial of the same degree on the same piece: a further row of the table of paths that a model follows.
 """
 
-import functools
-import inspect
 from dataclasses import field
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import as_numbers, by_name, finite, whole_of
+from servoctl.checks import by_name, column, finite, positive, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths.value import SAME, Path, taylor_at, varies
+from servoctl.spec.paths.value import Path
 from servoctl.values import Value, frozen
-
-MAKERS = {}  # by name
-
-
-def or_parameters(*numbers, times=None):
-    """The decorator of a maker of paths which makes a `ParametricPath` where some of its numbers are expressions.
-
-    `numbers` are the names of its arguments that may be, the first one that of a point, or of points at `times`; in
-    others expressions are refused.
-    """
-
-    def decorator(make):
-        MAKERS[make.__name__] = make
-
-        @functools.wraps(make)
-        def either(*args, **kwargs):
-            given = inspect.signature(make).bind(*args, **kwargs)
-            varied = [name for name, value in given.arguments.items() if varies(value)]
-            if others := set(varied) - {*numbers}:
-                _refuse(make.__name__, sorted(others), numbers)
-            if not varied:
-                return make(*args, **kwargs)
-            given.apply_defaults()
-            options = {name: value for name, value in given.arguments.items() if name not in numbers}
-            entries = {name: _entries(given.arguments[name]) for name in numbers}
-            count = entries[times][0].numel() if times else 1
-            return _parametric(make.__name__, entries, options, entries[numbers[0]][0].numel() // max(count, 1))
-
-        return either
-
-    return decorator
-
-
-def _refuse(maker, names, numbers):
-    """Refuse expressions where a maker of paths takes numbers alone."""
-    takes = f"in place of {', '.join(numbers)}" if numbers else "by rest_to_rest, trapezoid and spline"
-    raise SpecificationError(
-        f"There are expressions in {' and '.join(names)} of sv.paths.{maker.removesuffix('_through')}.",
-        f"Parameters are taken {takes}; a path of numbers is added to and multiplied by them.",
-        do="Write numbers, or path * p.a + p.b and path.at_rate(p.c).",
-        names=tuple(names),
-    )
-
-
-def _entries(value):
-    """The numbers of an argument as an SX column, row by row, and its shape."""
-    if isinstance(value, ca.SX):
-        return ca.vec(value.T), () if value.is_scalar() else (value.numel(),) if value.is_column() else value.shape
-    if not isinstance(value, (list, tuple)) and not np.ndim(value):
-        return ca.SX(float(as_numbers(value))), ()
-    rows = [_entries(row) for row in value]
-    shapes = [shape for _, shape in rows]
-    if len(set(shapes)) > 1:
-        rule, do = "Each has as many entries as the others.", "Write each point with as many entries."
-        raise SpecificationError(f"The points have the shapes {shapes}.", rule, do=do, shapes=shapes)
-    return ca.vertcat(ca.SX(0, 1), *(column for column, _ in rows)), (len(rows), *(shapes[0] if rows else ()))
-
-
-def _parametric(maker, entries, options, dim):
-    """The `ParametricPath` of a maker by its numbers, as of `_entries`, and its other arguments."""
-    column, base = ca.vertcat(*(part for part, _ in entries.values())), options.get("base")
-    symbols = ca.symvar(column)
-    known = {s.name(): s for s in symbols}
-    if len(known) < len(symbols):
-        raise SpecificationError(
-            f"The path contains two parameters of one name, {', '.join(sorted(s.name() for s in symbols))}.",
-            "Parameters of a path are known by their names.",
-            do="Take all of them from one sv.parameters(...).",
-            names=tuple(s.name() for s in symbols),
-        )
-    for name in parameters_of(base):
-        known.setdefault(name, ca.SX.sym(name))
-    p = ca.vertcat(*known.values())
-    f = ca.Function("numbers", [p], [ca.densify(column), ca.densify(ca.jacobian(column, p))])
-    shapes = {name: shape for name, (_, shape) in entries.items()}
-    return ParametricPath(maker, shapes, options, tuple(known), f.serialize(), dim)
 
 
 @frozen(eq=False)
@@ -106,26 +28,20 @@ class ParametricPath(Value):
 
     Attributes
     ----------
-    maker : str
-        The function that makes it.
-    shapes : dict of str to tuple
-        Of those of its arguments that are numbers.
-    options : dict
-        Its other arguments.
+    base : Path
+        Of numbers.
     names : tuple of str
-        Of its parameters.
-    content : str
-        The function of these that returns its numbers, and their derivatives, serialised.
+        Of the parameters.
     dim : int
         The number of components.
+    content : str
+        The function of the parameters that returns A (dim, n), b, t0 and T, serialised.
     """
 
-    maker: str
-    shapes: dict
-    options: dict
+    base: Path
     names: tuple
-    content: str
     dim: int
+    content: str
     __array_ufunc__ = None  # as of `Path`
 
     def at(self, **numbers: float) -> Path:
@@ -145,7 +61,7 @@ class ParametricPath(Value):
         NameUnknown
             For a name that is no parameter of the path.
         SpecificationError
-            For a parameter without a number, and for numbers with which there is no such path.
+            For a parameter without a number, and for a duration that is not positive.
         """
         numbers = by_name(numbers, self.names, "parameter of the path", "The numbers")
         if missing := [name for name in self.names if name not in numbers]:
@@ -161,35 +77,51 @@ class ParametricPath(Value):
     def _function(self):
         return ca.Function.deserialize(self.content)
 
-    def _given(self, numbers, directions=()):
-        """Values of its numbers by name, and their derivatives (K, ...) by some of the parameters."""
-        values, slopes = (np.array(part) for part in self._function([numbers[name] for name in self.names]))
-        zero = np.zeros(len(values))
-        slopes = [slopes[:, self.names.index(name)] if name in self.names else zero for name in directions]
-        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes.values()])[:-1]
-        parts = np.split(np.vstack([values.T, *slopes]), ends, axis=1)
-        parts = {n: part.reshape(-1, *shape) for (n, shape), part in zip(self.shapes.items(), parts, strict=True)}
-        given = {n: part[0] if self.shapes[n] else float(part[0]) for n, part in parts.items()}
-        return given, {n: part[1:] for n, part in parts.items()}
+    def _forms(self):
+        """A, b, t0 and T as expressions of symbols with the names of the parameters."""
+        return self._function(ca.vertcat(*(ca.SX.sym(name) for name in self.names)))
 
     def made(self, numbers):
         """The path with numbers of the parameters by name, among others."""
-        options = {name: path_at(one, numbers) if name == "base" else one for name, one in self.options.items()}
-        return MAKERS[self.maker](**self._given(numbers)[0], **options)
+        A, b, t0, T = (np.array(part) for part in self._function([numbers[name] for name in self.names]))
+        coefficients = A @ self.base.coefficients
+        coefficients[:, :, 0] += b[:, 0]
+        breaks = t0[0, 0] + positive("duration", T[0, 0]) * self.base.breaks
+        return Path(breaks, coefficients, self.base.classes, self.base.before, self.base.after)
 
-    def rates(self, numbers, directions):
+    @cached_property
+    def _slopes(self):
+        p = ca.vertcat(*(ca.SX.sym(name) for name in self.names))
+        return ca.Function("slopes", [p], [ca.densify(ca.jacobian(part, p)) for part in self._function(p)])
+
+    def _by(self, numbers, names):
+        """The derivatives of A (dim, n), b (dim,), t0 and T by some of the parameters, a list with these of each."""
+        slopes = [np.array(part) for part in self._slopes([numbers[name] for name in self.names])]
+        for i in map(self.names.index, names):
+            A, b, t0, T = (part[:, i] for part in slopes)
+            yield A.reshape(self.dim, -1, order="F"), b, t0[0], T[0]
+
+    def moved(self, numbers, name):
+        """The derivatives (n + 1,) of the breaks by a parameter."""
+        ((_, _, t0, T),) = self._by(numbers, [name])
+        return t0 + T * self.base.breaks
+
+    def rates(self, numbers, names):
         """The derivatives of the path by some of the parameters, a list of `Path`."""
-        path, breaks, coefficients = path_moved(self, numbers, directions)
-        half = np.diff(path.breaks) / 2
-        middle, longer = (breaks[:, 1:] + breaks[:, :-1]) / 2 / half, np.diff(breaks) / 2 / half
-        powers = np.arange(coefficients.shape[-1])
+        path, result = self.made(numbers), []
+        half, powers = np.diff(path.breaks) / 2, np.arange(path.coefficients.shape[-1])
         slopes = np.pad(path.coefficients[:, :, 1:] * powers[1:], ((0, 0), (0, 0), (0, 1)))
-        table = coefficients - middle[:, :, None, None] * slopes
-        table -= longer[:, :, None, None] * path.coefficients * powers
-        moves = (breaks != 0) & np.isfinite(path.classes)
-        self._require_known_outside(path, moves.any(axis=0))
-        classes, sides = np.maximum(path.classes - moves, -1.0), (path.before, path.after)
-        return [Path(path.breaks, c, rough, *sides) for c, rough in zip(table, classes, strict=True)]
+        for A, b, t0, T in self._by(numbers, names):
+            moves = t0 + T * self.base.breaks
+            middle, longer = (moves[1:] + moves[:-1]) / 2 / half, np.diff(moves) / 2 / half
+            table = A @ self.base.coefficients - middle[:, None, None] * slopes
+            table -= longer[:, None, None] * path.coefficients * powers
+            table[:, :, 0] += b
+            broken = (moves != 0) & np.isfinite(path.classes)
+            self._require_known_outside(path, broken)
+            classes = np.maximum(path.classes - broken, -1.0)
+            result.append(Path(path.breaks, table, classes, path.before, path.after))
+        return result
 
     def _require_known_outside(self, path, moves):
         """Refuse a path whose derivative is not held, or does not repeat, outside its breaks where these move."""
@@ -210,10 +142,14 @@ class ParametricPath(Value):
         return (self[i] for i in range(self.dim))
 
     def __getitem__(self, i):
-        return changed(self, component=whole_of("component", i, range(-self.dim, self.dim)))
+        A, b, t0, T = self._forms()
+        i = range(self.dim)[whole_of("component", i, range(-self.dim, self.dim))]
+        return parametric(self.base, A[i, :], b[i], t0, T)
 
     def __mul__(self, factor):
-        return changed(self, scale=factor)
+        A, b, t0, T = self._forms()
+        factor = column(factor, "multiple of a path", 1)[0]
+        return parametric(self.base, factor * A, factor * b, t0, T)
 
     __rmul__ = __mul__
 
@@ -221,7 +157,15 @@ class ParametricPath(Value):
         return self * -1.0
 
     def __add__(self, other):
-        return changed(self, offset=other)
+        """The sum with a constant: a number or an expression, or a vector (dim,) of them."""
+        if isinstance(other, (Path, ParametricPath)):
+            raise SpecificationError(
+                "A path is added to one with parameters.",
+                "A path with parameters is added to and multiplied by numbers and parameters.",
+                do="Name a reference for each path, q.references(a=..., b=...), and write r.a + r.b.",
+            )
+        A, b, t0, T = self._forms()
+        return parametric(self.base, A, b + ca.vertcat(*column(other, "constant", self.dim)), t0, T)
 
     __radd__ = __add__
 
@@ -230,6 +174,13 @@ class ParametricPath(Value):
 
     def __rsub__(self, other):
         return -self + other
+
+    def at_rate(self, factor, about=None):
+        """The path that runs so many times as fast, with `about` [s], by default its first break, where it was."""
+        A, b, t0, T = self._forms()
+        factor = column(factor, "factor", 1)[0]
+        about = t0 + T * self.base.breaks[0] if about is None else column(about, "about", 1)[0]
+        return parametric(self.base, A, b, about + (t0 - about) / factor, T / factor)
 
     def __call__(self, t):
         """Refused: it has no values without numbers."""
@@ -251,6 +202,18 @@ class ParametricPath(Value):
 
     def __repr__(self):
         return f"Path: {self.dim} component{'s' * (self.dim > 1)}, with the parameters {', '.join(self.names)}"
+
+
+def parametric(base, A, b, t0=0.0, T=1.0):
+    """The path A P((t - t0)/T) + b of a path P of numbers, with expressions A (dim, n), b (dim,), t0 and T."""
+    forms = [ca.densify(ca.SX(part)) for part in (A, b, t0, T)]
+    known = {}
+    symbols = ca.symvar(ca.vertcat(*map(ca.vec, forms)))
+    for symbol in symbols:
+        known.setdefault(symbol.name(), symbol)  # parameters of a path are known by their names
+    forms = ca.substitute(forms, [ca.vertcat(*symbols)], [ca.vertcat(*(known[s.name()] for s in symbols))])
+    f = ca.Function("numbers", [ca.vertcat(*known.values())], forms)
+    return ParametricPath(base, tuple(known), forms[0].size1(), f.serialize())
 
 
 @frozen(eq=False, repr=False)
@@ -276,131 +239,3 @@ def path_at(path, numbers):
 def parameters_of(path):
     """Names of the parameters of a path."""
     return path.names if isinstance(path, ParametricPath) else path.source.names if isinstance(path, PathAt) else ()
-
-
-# --- derivatives of the breaks and of the coefficients, by maker ------------------------------------------------------
-
-
-def path_moved(path, numbers, directions):
-    """A path with numbers, and derivatives of its breaks (K, n + 1) and of its coefficients (K, n, dim, size)."""
-    if not isinstance(path, ParametricPath):
-        return path, *(np.zeros((len(directions), *part.shape)) for part in (path.breaks, path.coefficients))
-    options = {n: path_moved(one, numbers, directions) if n == "base" else one for n, one in path.options.items()}
-    made = path.made(numbers)
-    return made, *RATES[path.maker](made, *path._given(numbers, directions), options)
-
-
-def _rest_to_rest_rates(path, given, rates, options):
-    times = {"duration": given["duration"], "t_start": given["t_start"]}
-    unit = MAKERS["rest_to_rest"](0.0, 1.0, **times, **options).coefficients
-    K = len(rates["start"])
-    start, end = (rates[name].reshape(K, 1, path.dim, 1) for name in ("start", "end"))
-    coefficients = (end - start) * unit
-    coefficients[..., :1] += start
-    part = (path.breaks - given["t_start"]) / given["duration"]
-    return rates["t_start"][:, None] + rates["duration"][:, None] * part, coefficients
-
-
-def _trapezoid_rates(path, given, rates, options):
-    """Of distance times a unit path, whose rise and fall are in proportion to ramp/(duration - ramp)."""
-    duration, ramp, t_start = (given[name] for name in ("duration", "ramp", "t_start"))
-    by_duration, by_ramp, by_start = (rates[name] for name in ("duration", "ramp", "t_start"))
-    corners = np.array([0.0, ramp, duration - ramp, duration]) + t_start
-    moves = np.column_stack([0.0 * by_ramp, by_ramp, by_duration - by_ramp, by_duration]) + by_start[:, None]
-    if corners[2] - corners[1] <= SAME * np.abs(corners).max() and (moves[:, 1] != moves[:, 2]).any():
-        raise SpecificationError(
-            f"The ramps of the trapezoid take its whole duration of {duration:g} s.",
-            "Where its cruise begins or ends with a parameter, it has derivatives to one side alone.",
-            do="Give it shorter ramps, or write ramp=duration/2.",
-            ramp=float(ramp),
-            duration=float(duration),
-        )
-    unit = MAKERS["trapezoid"](1.0, duration, ramp, t_start=t_start, **options).coefficients
-    middles, part = path.breaks[:-1] + np.diff(path.breaks) / 2, ramp / (duration - ramp)
-    rest = np.zeros_like(unit)  # the unit path without ramps
-    rest[middles > corners[2], :, 0] = 1.0
-    rest[(corners[1] < middles) & (middles < corners[2]), :, :2] = 0.5
-    by_part = (by_ramp * duration - ramp * by_duration) / (duration - ramp) ** 2
-    K, distance = len(by_ramp), np.reshape(given["distance"], (path.dim, 1))
-    coefficients = rates["distance"].reshape(K, 1, path.dim, 1) * unit
-    coefficients = coefficients + by_part[:, None, None, None] * distance * (unit - rest) / part
-    return np.array([np.interp(path.breaks, corners, move) for move in moves]), coefficients
-
-
-def _spline_rates(path, given, rates, options):
-    """The linear equations of the coefficients, differentiated.
-
-    At the times the values are the points, at breaks derivatives are the same on both sides, at both ends some vanish.
-    With Taylor coefficients T_k of pieces of half length h, dT_k = T_k(dc) - k T_k dh/h.
-    """
-    from scipy.sparse import lil_array
-    from scipy.sparse.linalg import splu
-
-    (n, dim, size), K, m = path.coefficients.shape, len(rates["times"]), path.coefficients.shape[2] // 2 - 1
-    moves = np.array([np.interp(path.breaks, given["times"], move) for move in rates["times"]])
-    longer = (np.diff(moves) / np.diff(path.breaks)).T[:, :, None]
-    starts, stops = (taylor_at(path.breaks, np.tile(np.eye(size), (n, 1, 1)), tau) for tau in (-1.0, 1.0))
-    values = taylor_at(path.breaks, path.coefficients, -1.0)[:, :, None]
-    points = np.moveaxis(rates["points"].reshape(K, -1, dim), 1, 0)
-    timed = np.isfinite(path.classes)
-    timed[[0, -1]] = True
-    vanishing = slice(1, m + 1) if options["ends"] == "rest" else slice(m + 1, 2 * m + 1)
-    matrix, right, row = lil_array((n * size, n * size)), np.zeros((n * size, K, dim)), 0
-    for i, point in enumerate(np.cumsum(timed) - 1):
-        before, after = slice((i - 1) * size, i * size), slice(i * size, (i + 1) * size)
-        here, side = (after, starts[:, i]) if i < n else (before, stops[:, -1])
-        if timed[i]:
-            matrix[row, here], right[row] = side[0], points[point]
-        row += timed[i]
-        count = size - timed[i] if 0 < i < n else m
-        some = slice(row, row + count)
-        if 0 < i < n:
-            matrix[some, before], matrix[some, after] = stops[:count, i - 1], -starts[:count, i]
-            right[some] = np.arange(count)[:, None, None] * values[:count, i] * (longer[i - 1] - longer[i])
-        else:
-            matrix[some, here] = side[vanishing]
-        row += count
-    solved = splu(matrix.tocsc()).solve(right.reshape(n * size, K * dim))
-    return moves, solved.reshape(n, size, K, dim).transpose(2, 0, 3, 1)
-
-
-def _changed(base, component, scale, offset, factor, about):
-    path = base if component is None else base[component]
-    return (path * scale + offset).at_rate(factor, about)
-
-
-def _changed_rates(_, given, rates, options):
-    """From those of the path that is changed."""
-    path, moves, table = options["base"]
-    some = slice(None) if options["component"] is None else [options["component"]]
-    coefficients = given["scale"] * table[:, :, some]
-    coefficients += rates["scale"][:, None, None, None] * path.coefficients[:, some]
-    coefficients[..., 0] += rates["offset"].reshape(len(moves), 1, -1)
-    factor, since = given["factor"], path.breaks - given["about"]
-    slower = rates["about"][:, None] * (1 - 1 / factor) - rates["factor"][:, None] * since / factor**2
-    return moves / factor + slower, coefficients
-
-
-MAKERS["changed"] = _changed
-RATES = {
-    "rest_to_rest": _rest_to_rest_rates,
-    "trapezoid": _trapezoid_rates,
-    "spline_through": _spline_rates,
-    "changed": _changed_rates,
-}
-
-
-def changed(base, component=None, scale=1.0, offset=None, factor=1.0, about=0.0):
-    """One component of a path, or all, times a number and plus a constant, along another clock."""
-    dim = base.dim if component is None else 1
-    numbers = {"scale": scale, "offset": np.zeros(dim) if offset is None else offset, "factor": factor, "about": about}
-    for one in numbers.values():
-        if isinstance(one, (Path, ParametricPath)):
-            raise SpecificationError(
-                "A path is added to one with parameters, or multiplied by it.",
-                "A path with parameters is added to and multiplied by numbers and parameters.",
-                do="Name a reference for each path, q.references(a=..., b=...), and write r.a + r.b.",
-            )
-    entries = {name: _entries(value) for name, value in numbers.items()}
-    base = base._with() if isinstance(base, PathAt) else base  # a path of numbers
-    return _parametric("changed", entries, {"base": base, "component": component}, dim)

@@ -165,6 +165,12 @@ class Path(Value):
                     end=float(self.breaks[end]),
                 )
 
+    def _parametric(self):
+        """The same path, whose numbers may become expressions."""
+        from servoctl.spec.paths.parametric import parametric
+
+        return parametric(self._with(), np.eye(self.dim), np.zeros(self.dim))
+
     def held(self):
         """The path that is held outside where nothing was said of it."""
         if self.before and self.after:
@@ -205,7 +211,7 @@ class Path(Value):
 
     def __mul__(self, factor):
         if varies(factor):
-            return parametric().changed(self, scale=factor)
+            return self._parametric() * factor
         return self._with(coefficients=self.coefficients * finite("factor", factor, "multiple of a path"))
 
     __rmul__ = __mul__
@@ -216,7 +222,7 @@ class Path(Value):
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
         if varies(other):
-            return parametric().changed(self, offset=other)
+            return self._parametric() + other
         if not isinstance(other, Path):
             constant = vector("The constant added to a path", other)
             _require_dim(self.dim, len(constant))
@@ -283,7 +289,7 @@ class Path(Value):
         Path
         """
         if varies([factor, about]):
-            return parametric().changed(self, factor=factor, about=self.breaks[0] if about is None else about)
+            return self._parametric().at_rate(factor, about)
         fixed = self.breaks[0] if about is None else finite("about", about, "instant")
         return self._with(breaks=fixed + (self.breaks - fixed) / positive("factor", factor))
 
@@ -325,14 +331,9 @@ def varies(value):
     """Whether what stands in place of a number is an expression of parameters, or contains one."""
     if isinstance(value, np.ndarray):
         return value.dtype == object and any(map(varies, value.ravel()))
-    return any(map(varies, value)) if isinstance(value, (list, tuple)) else isinstance(value, ca.SX)
-
-
-def parametric():
-    """The module of paths with parameters, which are made of these."""
-    from servoctl.spec.paths import parametric
-
-    return parametric
+    if isinstance(value, (list, tuple)):
+        return any(map(varies, value))
+    return isinstance(value, ca.SX) and not value.is_constant()
 
 
 def _require_dim(dim, other):
