@@ -54,3 +54,12 @@ def test_other_parameters_need_no_extended_precision(make, monkeypatch):
     name = list(model.numbers)[0]
     other = model.with_parameters(**{name: 1.1 * model.numbers[name]})
     assert other.reduction is model.reduction and np.array_equal(other.p[1:], other.parameters)
+
+
+def test_references_that_are_made_later_do_not_matter_to_a_model():
+    """Points at which ranks were decided have no jets of these: other parameters are judged at them all the same."""
+    model = cart()
+    model.reduction.mechanism.q.references(later=None, latest=sv.paths.rest_to_rest(0.0, 1.0, 1.0))
+    heavier = model.with_parameters(m=0.2)
+    run = sv.simulate(heavier, heavier.start(theta=0.0, dtheta=0.0), (0.0, 0.5))
+    assert run.success and sv.verify(run).passed
