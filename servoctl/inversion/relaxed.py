@@ -41,7 +41,6 @@ from servoctl.model.variants import derived_near
 from servoctl.plants.driven import at_once, driven
 from servoctl.plants.plant import Plant, part_of
 from servoctl.reduction.idle import names_of, needed
-from servoctl.reduction.knots import Switches
 from servoctl.reduction.reduce import require_parts
 from servoctl.run import Run
 from servoctl.spec.paths import piecewise
@@ -243,10 +242,8 @@ class Relaxation(Transfer):
         return replace(plan, beta=beta)
 
     def _mesh(self):
-        """Intervals of about the same length between the knots of the program."""
-        switches = Switches(self.node.q, self.program.residuals, self.plant.mechanism.parameters.symbols)
-        knots = [*switches.times(self.plant.parameters, self.span), *self.node.breaks(*self.span)]
-        corners = np.array(breakpoints(self.span, sorted({*knots})))
+        """Intervals of about the same length between the breaks of the program's paths."""
+        corners = np.array(breakpoints(self.span, sorted({*self.node.breaks(*self.span)})))
         counts = np.maximum(1, np.ceil(np.diff(corners) * INTERVALS / np.ptp(corners) * (1 - 1e-9))).astype(int)
         return Mesh(subdivided(corners, counts), ORDER)
 
