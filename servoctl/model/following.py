@@ -9,8 +9,8 @@ from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.model.points import with_place
-from servoctl.spec.paths.parametric import parameters_of, path_moved
-from servoctl.spec.paths.value import SAME
+from servoctl.spec.paths.parametric import path_moved
+from servoctl.spec.paths.value import SAME, parameters_of
 from servoctl.spec.references import required_paths
 
 SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
@@ -89,7 +89,7 @@ def p_with_rates(model, pairs):
         rates = []
         for reference in dict.fromkeys(r for r, _ in pairs):  # pairs are in their order
             of = [_written(model)[name] for r, name in pairs if r == reference]
-            rates += model.paths[reference].source.rates(_numbers(model), of)
+            rates += model.paths[reference].source.rates(_numbers_in_paths(model), of)
         known[pairs] = Followed([*model._followed.paths, *(rate.held() for rate in rates)])
     return with_place((known[pairs].address,), model.parameters)
 
@@ -105,7 +105,7 @@ def instant_by(model, name, t):
         if path.classes[k] <= model.reduction.follows[reference] and abs(path.breaks[k] - t) <= SAME * abs(t):
             moves = _written(model)[name] in parameters_of(path)
             rates[reference] = (
-                path_moved(path.source, _numbers(model), [_written(model)[name]])[1][0, k] if moves else 0.0
+                path_moved(path.source, _numbers_in_paths(model), [_written(model)[name]])[1][0, k] if moves else 0.0
             )
     if len({*rates.values()}) > 1:
         raise SpecificationError(
@@ -124,7 +124,7 @@ def _written(model):
     return {name: symbol.name() for name, symbol in zip(parameters.names, parameters.symbols, strict=True)}
 
 
-def _numbers(model):
+def _numbers_in_paths(model):
     """Values of the parameters as paths have them."""
     return dict(zip(_written(model).values(), model.parameters.tolist(), strict=True))
 

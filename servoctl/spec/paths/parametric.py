@@ -9,7 +9,6 @@ is a polynomial of the same degree on the same piece: a further row of the table
 
 import functools
 import inspect
-from dataclasses import field
 from functools import cached_property
 
 import casadi as ca
@@ -17,10 +16,18 @@ import numpy as np
 
 from servoctl.checks import as_numbers, by_name, finite, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths.value import SAME, Path, taylor_at, varies
+from servoctl.spec.paths.expansions import taylor_at
 from servoctl.values import Value, frozen
 
 MAKERS = {}  # by name
+OF_NUMBERS = "breaks coefficients classes before after jets held then at_rate plot"  # what a path with numbers has
+
+
+def varies(value):
+    """Whether what stands in place of a number is an expression of parameters, or contains one."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and any(map(varies, value.ravel()))
+    return any(map(varies, value)) if isinstance(value, (list, tuple)) else isinstance(value, ca.SX)
 
 
 def or_parameters(*numbers, times=None):
@@ -38,12 +45,12 @@ def or_parameters(*numbers, times=None):
             given = inspect.signature(make).bind(*args, **kwargs)
             varied = [name for name, value in given.arguments.items() if varies(value)]
             if others := set(varied) - {*numbers}:
-                _refuse(make.__name__, sorted(others), numbers)
+                _refuse_expressions(make.__name__, sorted(others), numbers)
             if not varied:
                 return make(*args, **kwargs)
             given.apply_defaults()
             options = {name: value for name, value in given.arguments.items() if name not in numbers}
-            entries = {name: _entries(given.arguments[name]) for name in numbers}
+            entries = {name: _as_column(given.arguments[name]) for name in numbers}
             count = entries[times][0].numel() if times else 1
             return _parametric(make.__name__, entries, options, entries[numbers[0]][0].numel() // max(count, 1))
 
@@ -52,7 +59,7 @@ def or_parameters(*numbers, times=None):
     return decorator
 
 
-def _refuse(maker, names, numbers):
+def _refuse_expressions(maker, names, numbers):
     """Refuse expressions where a maker of paths takes numbers alone."""
     takes = f"in place of {', '.join(numbers)}" if numbers else "by rest_to_rest, trapezoid and spline"
     raise SpecificationError(
@@ -63,13 +70,13 @@ def _refuse(maker, names, numbers):
     )
 
 
-def _entries(value):
+def _as_column(value):
     """The numbers of an argument as an SX column, row by row, and its shape."""
     if isinstance(value, ca.SX):
         return ca.vec(value.T), () if value.is_scalar() else (value.numel(),) if value.is_column() else value.shape
     if not isinstance(value, (list, tuple)) and not np.ndim(value):
         return ca.SX(float(as_numbers(value))), ()
-    rows = [_entries(row) for row in value]
+    rows = [_as_column(row) for row in value]
     shapes = [shape for _, shape in rows]
     if len(set(shapes)) > 1:
         rule, do = "Each has as many entries as the others.", "Write each point with as many entries."
@@ -78,7 +85,7 @@ def _entries(value):
 
 
 def _parametric(maker, entries, options, dim):
-    """The `ParametricPath` of a maker by its numbers, as of `_entries`, and its other arguments."""
+    """The `ParametricPath` of a maker by its numbers, as of `_as_column`, and its other arguments."""
     column, base = ca.vertcat(*(part for part, _ in entries.values())), options.get("base")
     symbols = ca.symvar(column)
     known = {s.name(): s for s in symbols}
@@ -89,7 +96,7 @@ def _parametric(maker, entries, options, dim):
             do="Take all of them from one sv.parameters(...).",
             names=tuple(s.name() for s in symbols),
         )
-    for name in parameters_of(base):
+    for name in base.names if isinstance(base, ParametricPath) else ():
         known.setdefault(name, ca.SX.sym(name))
     p = ca.vertcat(*known.values())
     f = ca.Function("numbers", [p], [ca.densify(column), ca.densify(ca.jacobian(column, p))])
@@ -128,7 +135,7 @@ class ParametricPath(Value):
     dim: int
     __array_ufunc__ = None  # as of `Path`
 
-    def at(self, **numbers: float) -> Path:
+    def at(self, **numbers: float):
         """The path with numbers of its parameters.
 
         Parameters
@@ -174,7 +181,8 @@ class ParametricPath(Value):
 
     def made(self, numbers):
         """The path with numbers of the parameters by name, among others."""
-        options = {name: path_at(one, numbers) if name == "base" else one for name, one in self.options.items()}
+        base = self.options.get("base")
+        options = self.options | ({"base": base.made(numbers)} if isinstance(base, ParametricPath) else {})
         return MAKERS[self.maker](**self._given(numbers)[0], **options)
 
     def rates(self, numbers, directions):
@@ -188,8 +196,8 @@ class ParametricPath(Value):
         table -= longer[:, :, None, None] * path.coefficients * powers
         moves = (breaks != 0) & np.isfinite(path.classes)
         self._require_known_outside(path, moves.any(axis=0))
-        classes, sides = np.maximum(path.classes - moves, -1.0), (path.before, path.after)
-        return [Path(path.breaks, c, rough, *sides) for c, rough in zip(table, classes, strict=True)]
+        classes = np.maximum(path.classes - moves, -1.0)
+        return [path._with(coefficients=c, classes=rough) for c, rough in zip(table, classes, strict=True)]
 
     def _require_known_outside(self, path, moves):
         """Refuse a path whose derivative is not held, or does not repeat, outside its breaks where these move."""
@@ -236,8 +244,8 @@ class ParametricPath(Value):
         raise self._without_numbers("path(t)")
 
     def __getattr__(self, name):
-        if name.startswith("_") or not hasattr(Path, name) and name not in Path.__dataclass_fields__:
-            raise AttributeError(name)
+        if name not in OF_NUMBERS.split():
+            raise AttributeError(f"A path with parameters has no attribute {name!r}.")
         raise self._without_numbers(f"path.{name}")
 
     def _without_numbers(self, what):
@@ -251,31 +259,6 @@ class ParametricPath(Value):
 
     def __repr__(self):
         return f"Path: {self.dim} component{'s' * (self.dim > 1)}, with the parameters {', '.join(self.names)}"
-
-
-@frozen(eq=False, repr=False)
-class PathAt(Path):
-    """A path with the numbers of a model, and the one with parameters that it was made of, its `source`."""
-
-    source: ParametricPath = field(default=None, repr=False)
-
-    def __reduce__(self):
-        return PathAt, (*super().__reduce__()[1], self.source)
-
-
-def path_at(path, numbers):
-    """A path with numbers of parameters by name: itself if it contains none."""
-    source = path.source if isinstance(path, PathAt) else path
-    if not isinstance(source, ParametricPath):
-        return path
-    made = source.made(numbers)
-    said = f"with {', '.join(f'{name} = {numbers[name]:g}' for name in source.names)}"
-    return PathAt(made.breaks, made.coefficients, made.classes, made.before, made.after, said, source)
-
-
-def parameters_of(path):
-    """Names of the parameters of a path."""
-    return path.names if isinstance(path, ParametricPath) else path.source.names if isinstance(path, PathAt) else ()
 
 
 # --- derivatives of the breaks and of the coefficients, by maker ------------------------------------------------------
@@ -307,7 +290,9 @@ def _trapezoid_rates(path, given, rates, options):
     by_duration, by_ramp, by_start = (rates[name] for name in ("duration", "ramp", "t_start"))
     corners = np.array([0.0, ramp, duration - ramp, duration]) + t_start
     moves = np.column_stack([0.0 * by_ramp, by_ramp, by_duration - by_ramp, by_duration]) + by_start[:, None]
-    if corners[2] - corners[1] <= SAME * np.abs(corners).max() and (moves[:, 1] != moves[:, 2]).any():
+    middles, part = path.breaks[:-1] + np.diff(path.breaks) / 2, ramp / (duration - ramp)
+    cruising = (corners[1] < middles) & (middles < corners[2])
+    if not cruising.any() and (moves[:, 1] != moves[:, 2]).any():
         raise SpecificationError(
             f"The ramps of the trapezoid take its whole duration of {duration:g} s.",
             "Where its cruise begins or ends with a parameter, it has derivatives to one side alone.",
@@ -316,10 +301,9 @@ def _trapezoid_rates(path, given, rates, options):
             duration=float(duration),
         )
     unit = MAKERS["trapezoid"](1.0, duration, ramp, t_start=t_start, **options).coefficients
-    middles, part = path.breaks[:-1] + np.diff(path.breaks) / 2, ramp / (duration - ramp)
     rest = np.zeros_like(unit)  # the unit path without ramps
     rest[middles > corners[2], :, 0] = 1.0
-    rest[(corners[1] < middles) & (middles < corners[2]), :, :2] = 0.5
+    rest[cruising, :, :2] = 0.5
     by_part = (by_ramp * duration - ramp * by_duration) / (duration - ramp) ** 2
     K, distance = len(by_ramp), np.reshape(given["distance"], (path.dim, 1))
     coefficients = rates["distance"].reshape(K, 1, path.dim, 1) * unit
@@ -395,12 +379,11 @@ def changed(base, component=None, scale=1.0, offset=None, factor=1.0, about=0.0)
     dim = base.dim if component is None else 1
     numbers = {"scale": scale, "offset": np.zeros(dim) if offset is None else offset, "factor": factor, "about": about}
     for one in numbers.values():
-        if isinstance(one, (Path, ParametricPath)):
+        if isinstance(one, Value):
             raise SpecificationError(
                 "A path is added to one with parameters, or multiplied by it.",
                 "A path with parameters is added to and multiplied by numbers and parameters.",
                 do="Name a reference for each path, q.references(a=..., b=...), and write r.a + r.b.",
             )
-    entries = {name: _entries(value) for name, value in numbers.items()}
-    base = base._with() if isinstance(base, PathAt) else base  # a path of numbers
+    entries = {name: _as_column(value) for name, value in numbers.items()}
     return _parametric("changed", entries, {"base": base, "component": component}, dim)

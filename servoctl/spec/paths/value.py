@@ -2,11 +2,12 @@
 
 from dataclasses import field
 
-import casadi as ca
 import numpy as np
 
 from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
 from servoctl.errors import SpecificationError
+from servoctl.spec.paths.expansions import taylor, taylor_at
+from servoctl.spec.paths.parametric import ParametricPath, changed, varies
 from servoctl.values import Value, frozen, read_only
 
 RULES = ("hold", "continue", "periodic", None)
@@ -197,7 +198,7 @@ class Path(Value):
 
     def __mul__(self, factor):
         if varies(factor):
-            return parametric().changed(self, scale=factor)
+            return changed(self._with(), scale=factor)
         return self._with(coefficients=self.coefficients * finite("factor", factor, "multiple of a path"))
 
     __rmul__ = __mul__
@@ -207,8 +208,8 @@ class Path(Value):
 
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
-        if varies(other):
-            return parametric().changed(self, offset=other)
+        if varies(other) or isinstance(other, ParametricPath):
+            return changed(self._with(), offset=other)
         if not isinstance(other, Path):
             constant = vector("The constant added to a path", other)
             _require_dim(self.dim, len(constant))
@@ -222,7 +223,7 @@ class Path(Value):
     __radd__ = __add__
 
     def __sub__(self, other):
-        if varies(other):
+        if varies(other) or isinstance(other, ParametricPath):
             return -(-self + other)
         return self + (-other if isinstance(other, Path) else -vector("The constant taken from a path", other))
 
@@ -275,7 +276,7 @@ class Path(Value):
         Path
         """
         if varies([factor, about]):
-            return parametric().changed(self, factor=factor, about=self.breaks[0] if about is None else about)
+            return changed(self._with(), factor=factor, about=self.breaks[0] if about is None else about)
         fixed = self.breaks[0] if about is None else finite("about", about, "instant")
         return self._with(breaks=fixed + (self.breaks - fixed) / positive("factor", factor))
 
@@ -313,20 +314,6 @@ class Path(Value):
         return text + f"\n  {self.remark}" * bool(self.remark)
 
 
-def varies(value):
-    """Whether what stands in place of a number is an expression of parameters, or contains one."""
-    if isinstance(value, np.ndarray):
-        return value.dtype == object and any(map(varies, value.ravel()))
-    return any(map(varies, value)) if isinstance(value, (list, tuple)) else isinstance(value, ca.SX)
-
-
-def parametric():
-    """The module of paths with parameters, which are made of these."""
-    from servoctl.spec.paths import parametric
-
-    return parametric
-
-
 def _require_dim(dim, other):
     if dim != other:
         rule = "Paths are joined component by component."
@@ -350,24 +337,6 @@ def require_ascending(name, breaks):
             do="Sort them, and remove repeated ones.",
             index=i + 1,
         )
-
-
-def taylor(coefficients, pieces, tau, order):
-    """Taylor coefficients (order + 1, N, dim) of pieces (N,) of a table (n, dim, size), at local times (N,)."""
-    tau, result = tau[:, None], np.zeros((order + 1, len(tau), coefficients.shape[1]))
-    for j in reversed(range(coefficients.shape[2])):
-        result[1:] = result[1:] * tau + result[:-1]
-        result[0] = result[0] * tau + coefficients[pieces, :, j]
-    return result
-
-
-def taylor_at(breaks, coefficients, tau):
-    """Taylor coefficients (size, n, dim) of all pieces at one local time, in units of half their mean length."""
-    n, _, size = coefficients.shape
-    lengths = np.diff(breaks)
-    with np.errstate(over="ignore", invalid="ignore"):  # of the shortest of very uneven pieces
-        unit = (lengths.mean() / lengths) ** np.arange(size)[:, None]
-        return taylor(coefficients, np.arange(n), np.full(n, float(tau)), size - 1) * unit[:, :, None]
 
 
 def counted(breaks, coefficients, before=None, after=None):
@@ -443,3 +412,28 @@ def stacked(*paths):
     """One path with the components of several, on common breaks, each of the lowest of their classes."""
     tables, fields = together(*paths)
     return Path(coefficients=np.concatenate(tables, axis=1), **fields)
+
+
+@frozen(eq=False, repr=False)
+class PathAt(Path):
+    """A path with the numbers of a model, and the one with parameters that it was made of, its `source`."""
+
+    source: ParametricPath = field(default=None, repr=False)
+
+    def __reduce__(self):
+        return PathAt, (*super().__reduce__()[1], self.source)
+
+
+def path_at(path, numbers):
+    """A path with numbers of parameters by name: itself if it contains none."""
+    source = path.source if isinstance(path, PathAt) else path
+    if not isinstance(source, ParametricPath):
+        return path
+    made = source.made(numbers)
+    said = f"with {', '.join(f'{name} = {numbers[name]:g}' for name in source.names)}"
+    return PathAt(made.breaks, made.coefficients, made.classes, made.before, made.after, said, source)
+
+
+def parameters_of(path):
+    """Names of the parameters of a path."""
+    return path.names if isinstance(path, ParametricPath) else path.source.names if isinstance(path, PathAt) else ()
