@@ -10,10 +10,10 @@ import numpy as np
 from servoctl.checks import array_of, as_numbers, column, finite, named, positive, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.spec.paths import expressions
-from servoctl.spec.paths.parametric import parametric
+from servoctl.spec.paths.parametric import parametric, varies
 from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
 from servoctl.spec.paths.transition import or_expression
-from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, varies, vector
+from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, vector
 
 
 @or_expression(expressions.rest_to_rest)
