@@ -197,7 +197,10 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
         If `ends` is neither "rest" nor "natural".
     """
     if varies(points):
-        points = points if isinstance(points, ca.SX) else ca.vertcat(*(ca.horzcat(*column(x, "point")) for x in points))
+        if not isinstance(points, ca.SX):
+            dim = len(column(points[0], "point 0"))
+            rows = (ca.horzcat(*column(point, f"point {i}", dim)) for i, point in enumerate(points))
+            points = ca.vertcat(*rows)
         unit = spline_through(times, np.eye(points.shape[0]), smoothness=smoothness, ends=ends)
         return parametric(unit, points.T, ca.SX.zeros(points.shape[1]))
     rest, k = named(ends, ("rest", "natural"), "spline end") == "rest", _class(smoothness)
