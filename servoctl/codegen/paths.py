@@ -38,13 +38,14 @@ class Followed:
 
     def jets(self, t, order, instant=None):
         """Derivatives 0 .. `order` at times (N,), of the pieces that instants (N,) select: ((order + 1) n, N)."""
-        key = (order, *np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
+        key = tuple(np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
         last, jets = self._last
-        if key is None or key != last:  # iterations ask for one instant again and again
+        size = (order + 1) * len(self.paths)
+        if key is None or key != last or len(jets) < size:  # functions ask for one instant again and again
             rows = [path.jets(t, order, instant)[:, 0] for path in self.paths]
             jets = np.stack(rows, axis=1).reshape(-1, len(t))
             self._last = (key, jets) if key else self._last
-        return jets
+        return jets[:size]
 
 
 def followed(address):
