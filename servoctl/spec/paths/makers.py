@@ -143,7 +143,7 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     from scipy.interpolate import PPoly
 
     start, end = _ends(start, end)
-    distance = float(np.linalg.norm(end - start))
+    distance = math.hypot(*(end - start))
     if distance == 0.0:
         rule, do = "They differ.", "Use rest_to_rest for a path that stands still."
         raise SpecificationError(f"start and end are both {end.tolist()}.", rule, do=do, start=end.tolist())
@@ -153,6 +153,14 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     constant = max(0.0, min(v / a - rise, math.sqrt(rise**2 / 4 + distance / a) - 1.5 * rise))  # of the acceleration
     cruise = max(0.0, distance / (a * (rise + constant)) - 2 * rise - constant)
     phases = np.array([rise, constant, rise, cruise, rise, constant, rise])
+    if not rise > SAME * phases.sum():
+        raise SpecificationError(
+            f"Of {phases.sum():.3g} s in all, the acceleration rises for {rise:.3g} s.",
+            f"Phases of a path last for more than {SAME:g} of it: shorter ones are rounding.",
+            do="Give a shorter distance, a higher speed or a lower jerk.",
+            duration=float(phases.sum()),
+            rise=rise,
+        )
     lasting = phases > SAME * phases.sum()  # others are rounding
     breaks = np.append(0.0, np.cumsum(phases[lasting]))
     jerks = np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])[lasting] * j / distance

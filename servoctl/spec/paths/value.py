@@ -64,13 +64,7 @@ class Path(Value):
                 shape=shape,
             )
         require_ascending("breaks", self.breaks)
-        if not {self.before, self.after} <= set(RULES) or (self.before == "periodic") != (self.after == "periodic"):
-            raise SpecificationError(
-                f"The path has before={self.before!r}, after={self.after!r}.",
-                f"Each is one of {', '.join(map(repr, RULES))}, and a path that is periodic is so on both sides.",
-                before=self.before,
-                after=self.after,
-            )
+        _require_rules(self.before, self.after)
 
     @property
     def dim(self):
@@ -368,8 +362,20 @@ def taylor_at(breaks, coefficients, tau):
         return taylor(coefficients, np.arange(n), np.full(n, float(tau)), size - 1) * unit[:, :, None]
 
 
+def _require_rules(before, after):
+    named = all(rule is None or isinstance(rule, str) and rule in RULES for rule in (before, after))
+    if not named or (before == "periodic") != (after == "periodic"):
+        raise SpecificationError(
+            f"The path has before={before!r}, after={after!r}.",
+            f"Each is one of {', '.join(map(repr, RULES))}, and a path that is periodic is so on both sides.",
+            before=before,
+            after=after,
+        )
+
+
 def counted(breaks, coefficients, before=None, after=None):
     """The classes (n + 1,) at breaks, as far as derivatives agree up to `COUNTED` of their sizes."""
+    _require_rules(before, after)
     starts, stops = (taylor_at(breaks, coefficients, tau) for tau in (-1.0, 1.0))
     jumps = np.concatenate([starts[:, :1], starts[:, 1:] - stops[:, :-1], stops[:, -1:]], axis=1)
     jumps[0, [0, -1]] = 0.0  # at the ends: how many derivatives vanish
