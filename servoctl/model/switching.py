@@ -27,7 +27,7 @@ class Switching:
         r, q = model.reduction, model.reduction.mechanism.q
         self.model = model
         names = r.mechanism.parameters.names
-        branches = Branches(q.is_jet, names)
+        branches = Branches(q.moves, names)
         self._specification = _smooth(r.mechanism, r.program, _angles(model), branches)
         self.switches = branches.switches
         for s in self.switches:
