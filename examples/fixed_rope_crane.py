@@ -22,8 +22,8 @@ def crane():
         actuators={"cart": x},
         parameters=p,
     )
-    path = sv.paths.rest_to_rest(q.t, start=0.0, end=5.0, duration=6.0, smoothness=4)
-    return mechanism, sv.Program({"X": load[0] - path})
+    r = q.references(X=sv.paths.rest_to_rest(start=0.0, end=5.0, duration=6.0, smoothness=4))
+    return mechanism, sv.Program({"X": load[0] - r.X})
 
 
 def save_figure(front, plans, path):

@@ -11,7 +11,8 @@ def crane(duration=6.0):
     x, l, theta = q
     load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))  # m; second entry down
     S = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load)
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 4.0), end=(5.0, 2.0), duration=duration, smoothness=4)
+    path = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(5.0, 2.0), duration=duration, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
     return (
         sv.Mechanism(
             q,
@@ -20,7 +21,7 @@ def crane(duration=6.0):
             actuators={"trolley": x, "hoist": l},  # by the displacement that a force works on
             parameters=p,
         ),
-        sv.Program({"X": load[0] - path[0], "Z": load[1] - path[1]}, by="actuators"),
+        sv.Program({"X": load[0] - r.X, "Z": load[1] - r.Z}, by="actuators"),
     )
 
 

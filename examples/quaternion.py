@@ -23,10 +23,10 @@ q = e.with_quasi_velocities(
 
 S = sv.rigid_body(q, mass=0, inertia=(p.J_t, p.J_t, p.J_a), rates=q.w())  # (3.11)
 mechanism = sv.Mechanism(q, gibbs=S, actuators={"torque1": (1, 0, 0), "torque2": (0, 1, 0)}, parameters=p)
-angle = sv.paths.rest_to_rest(q.t, 0.0, np.pi / 3, duration=10.0, smoothness=2)  # rad
+r = q.references(angle=sv.paths.rest_to_rest(0.0, np.pi / 3, duration=10.0, smoothness=2))  # rad
 program = sv.Program(
     {
-        "across": 2 * (e1 * e3 + e0 * e2) - ca.sin(angle),  # the axis is (sin a, 0, cos a) in inertial axes
+        "across": 2 * (e1 * e3 + e0 * e2) - ca.sin(r.angle),  # the axis is (sin a, 0, cos a) in inertial axes
         "aside": 2 * (e2 * e3 - e0 * e1),
     }
 )

@@ -25,10 +25,10 @@ def vehicle(weights=None, toward=None):
         "bow": ca.vertcat(left, p.lever),
         "stern": ca.vertcat(left, -p.lever),
     }
-    track = sv.paths.rest_to_rest(q.t, start=(0.0, 0.0), end=(2.0, 1.0), duration=4.0, smoothness=2)
-    turn = sv.paths.rest_to_rest(q.t, 0.0, np.pi / 2, duration=4.0, smoothness=2)
+    path = sv.paths.rest_to_rest(start=(0.0, 0.0, 0.0), end=(2.0, 1.0, np.pi / 2), duration=4.0, smoothness=2)
+    r = q.references(X=path[0], Y=path[1], heading=path[2])
     mechanism = sv.Mechanism(q, gibbs=S, actuators=actuators, parameters=p)
-    program = sv.Program({"X": x - track[0], "Y": y - track[1], "heading": psi - turn}, weights=weights, toward=toward)
+    program = sv.Program({"X": x - r.X, "Y": y - r.Y, "heading": psi - r.heading}, weights=weights, toward=toward)
     return mechanism, program
 
 

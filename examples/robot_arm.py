@@ -13,8 +13,8 @@ def main(fast=False):
     """Torques of the plan [N m] and errors of the loop [mm, mrad]; `fast` checks fewer segments of the plan."""
     arm = sv.urdf(Path(__file__).parent / "robots" / "six_axis_arm.urdf", symbolic=("tool",))
     position, rotation = arm.at(HOME, "tool")
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, duration=2.0)
-    line = sv.paths.line(s, position, position + np.array([0.05, -0.15, -0.1]))
+    (s,) = arm.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0))
+    line = sv.curves.line(s, position, position + np.array([0.05, -0.15, -0.1]))
     turned = sv.rotations.turn(0.6 * s, (0, 0, 1), rotation)
     mechanism = arm.mechanism()
     model = sv.derive(mechanism, sv.Program(sv.programs.pose("tool", arm.frame("tool"), line, turned)))

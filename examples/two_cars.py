@@ -15,11 +15,11 @@ def two_cars(by):
     q = sv.coordinates("x1 x2")  # m, m
     x1, x2 = q
     S = sv.particle(q, p.m1, x1) + sv.particle(q, p.m2, x2)
-    path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=2.0, smoothness=6)
+    r = q.references(y=sv.paths.rest_to_rest(0.5, 2.5, duration=2.0, smoothness=6))
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=p.k * (x1 - x2 - p.gap) ** 2 / 2, actuators={"force": x2}, parameters=p
     )
-    return mechanism, sv.Program({"car 1": x1 - path}, by=by)
+    return mechanism, sv.Program({"car 1": x1 - r.y}, by=by)
 
 
 def main(fast=False):

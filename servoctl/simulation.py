@@ -48,8 +48,9 @@ from servoctl.methods.stability import run_checked, warn_drifted, warn_many_step
 from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
 from servoctl.methods.transient import first_transient
 from servoctl.model.equations import invariant_names
+from servoctl.model.following import SMOOTHER, breaks_within
 from servoctl.model.jets import extended, jet_names_to, with_highest
-from servoctl.model.model import Model, including, knots_within
+from servoctl.model.model import Model, including
 from servoctl.model.start import State
 from servoctl.model.switching import switching
 from servoctl.plants.driven import driven
@@ -221,12 +222,8 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     method, drift = _method_and_drift(model, method, drift, t0, t1)
     leads_back = isinstance(method, (Algebraic, Bounded)) or isinstance(drift, Poles)
     x0 = as_state(model, start, t0) if leads_back else consistent_state(model, start, t0, isinstance(drift, Project))
-    if isinstance(method, Algebraic):
-        knots = knots_within(model, span)
-    else:
-        knots = knots_within(model, span, method.order if isinstance(method, RungeKutta) else np.inf)
-        ends = model.reduction.switches.ends_of_pieces(model.parameters, (min(span), max(span)))
-        knots = tuple(sorted({*knots, *ends.tolist()}))
+    smoother = SMOOTHER if isinstance(method, Algebraic) else method.order if isinstance(method, RungeKutta) else np.inf
+    knots = breaks_within(model, span, smoother)
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
     try:

@@ -17,6 +17,7 @@ from servoctl.sensitivities.identification import Identification
 from servoctl.sensitivities.sensitivity import Sensitivity
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.parameters import Parameters
+from servoctl.streaming import Feedforward
 from servoctl.study.batch import Batch
 from servoctl.study.stability_map import StabilityMap
 from servoctl.study.table import Study
@@ -29,6 +30,7 @@ __all__ = [
     "Controller",
     "Coordinates",
     "Design",
+    "Feedforward",
     "Frame",
     "Identification",
     "InternalDynamics",

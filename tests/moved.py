@@ -19,6 +19,7 @@ def moved(mechanism, program, shifts=None, scales=None, reverse=False):
     place = [order.index(i) for i in range(q.nq)]
     s, c = (ca.SX([(some or {}).get(name, float(k)) for name in q.names]) for some, k in ((scales, 1), (shifts, 0)))
     bare = sv.coordinates(" ".join(names[i] for i in order))
+    bare.family = q.family  # the same references
 
     def there(expression, new=bare, jets=0):
         old = ca.vertcat(q.t, *(q.jet(k) for k in range(jets + 1)))

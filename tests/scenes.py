@@ -24,9 +24,9 @@ def point_mass(smoothness=3):
     p = sv.parameters(m=2.0)
     q = sv.coordinates("x")
     (x,) = q
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=smoothness)
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=smoothness))
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"force": x}, parameters=p)
-    return mechanism, sv.Program({"X": x - path}, by="actuators")
+    return mechanism, sv.Program({"X": x - r.X}, by="actuators")
 
 
 POINT, POINT_PROGRAM = point_mass()

@@ -148,12 +148,12 @@ DOORS = {
     "gibbs": lambda v: sv.Mechanism(FREE, v),
     "residual": lambda v: sv.Program({"X": X - FREE.t, "Y": v}),
     "slowed program": lambda v: sv.Program({"X": X - FREE.t}).slowed(FREE, v),
-    "path": lambda v: sv.paths.rest_to_rest(FREE.t, 0.0, v, 1.0),
-    "points of a path": lambda v: sv.paths.spline(FREE.t, [0.0, 1.0, 2.0], [0.0, v, 1.0]),
+    "path": lambda v: sv.paths.rest_to_rest(0.0, v, 1.0),
+    "points of a path": lambda v: sv.paths.spline([0.0, 1.0, 2.0], [0.0, v, 1.0]),
     "gust": lambda v: GUST(v, 0.0, 1.0),
     "rate": lambda v: sv.Timing(rate=v),
     "tolerance": lambda v: sv.methods.Taylor(rtol=v),
-    "axes of a circle": lambda v: sv.paths.circle(FREE.t, (0.0, 0.0), 1.0, axes=v),
+    "axes of a circle": lambda v: sv.curves.circle(FREE.t, (0.0, 0.0), 1.0, axes=v),
 }
 
 
@@ -195,10 +195,6 @@ def test_exported_c_answers_numbers_or_its_error(name, gallery_model, tmp_path, 
 # integrals of a program ----------------------------------------------------------------------------------------------
 
 
-def rate(path, q):
-    return ca.jacobian(path, q.t)
-
-
 def cart_and_pole(by, damping=0.0):
     """The tutorial's machine, programmed by its place, by its speed, or by the speed of the bob."""
     p, q = sv.parameters(M=2.0, m=0.5, L=0.6, g=G), sv.coordinates("x theta")
@@ -208,8 +204,8 @@ def cart_and_pole(by, damping=0.0):
         q, sv.particle(q, p.M, x) + sv.particle(q, p.m, bob), potential=p.m * p.g * bob[1], actuators={"F": x},
         forces={"x": -damping * dx}, parameters=p,
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.5, smoothness=4)
-    residual = {"place": x - path, "speed": dx - rate(path, q)}
+    r = q.references(path=sv.paths.rest_to_rest(0.0, 1.0, 1.5, smoothness=4))
+    residual = {"place": x - r.path, "speed": dx - r.d(1)[0]}
     return mechanism, sv.Program(residual if by is None else {by: residual[by]})
 
 
@@ -230,11 +226,13 @@ def test_a_program_of_a_speed_has_the_inverse_of_its_place(damping):
 def test_a_cart_whose_speed_goes_on_has_the_inverse_of_its_place(damping):
     """From rest to 1 m/s: the place is the integral of the speed, 126 u⁵ - 420 u⁶ + 540 u⁷ - 315 u⁸ + 70 u⁹."""
     mechanism, _ = cart_and_pole("speed", damping)
-    (x, _), (dx, _), t = mechanism.q, mechanism.q.d(1), mechanism.q.t
-    u = ca.fmin(t / 1.5, 1.0)
-    place = 1.5 * (21 * u**6 - 60 * u**7 + 67.5 * u**8 - 35 * u**9 + 7 * u**10) + ca.fmax(t - 1.5, 0.0)
-    speed = sv.paths.rest_to_rest(t, 0.0, 1.0, 1.5, smoothness=4)
-    residuals = {"place": x - ca.if_else(t > 0, place, 0.0), "speed": dx - speed}
+    (x, _), (dx, _) = mechanism.q, mechanism.q.d(1)
+    rising = [1.5 * c / 1.5**k for k, c in zip(range(10, 5, -1), (7.0, -35.0, 67.5, -60.0, 21.0), strict=True)]
+    place = sv.paths.polynomials(
+        [0.0, 1.5, 3.0], np.transpose([rising + 6 * [0.0], 9 * [0.0] + [1.0, 0.75]]), after="continue"
+    )
+    r = mechanism.q.references(along=place, rate=sv.paths.rest_to_rest(0.0, 1.0, 1.5, smoothness=4))
+    residuals = {"place": x - r.along, "speed": dx - r.rate}
     place, speed = (sv.inverse(mechanism, sv.Program({by: e}), (0.0, 1.5)) for by, e in residuals.items())
     assert "inverse: bounded" in speed.message and "0 is the constant of x" in speed.message
     for name in ("F", "x", "theta"):
@@ -257,9 +255,10 @@ def segway(by):
         potential=30.0 * G * body[2], constraints={"slide": dy * ca.cos(psi) - dx * ca.sin(psi), **rolling},
         actuators={"L": left - a, "R": right - a},
     )  # fmt: skip
-    along, turn = (sv.paths.rest_to_rest(q.t, 0.0, end, 3.0, smoothness=5) for end in (3.0, 1.2))
-    heading = {"heading": psi - turn} if by == "heading" else {"rate": dpsi - rate(turn, q)}
-    return mechanism, sv.Program({"speed": v - rate(along, q), **heading})
+    path = sv.paths.rest_to_rest((0.0, 0.0), (3.0, 1.2), 3.0, smoothness=5)
+    r = q.references(along=path[0], turn=path[1])
+    heading = {"heading": psi - r.turn} if by == "heading" else {"rate": dpsi - r.d(1)[1]}
+    return mechanism, sv.Program({"speed": v - r.d(1)[0], **heading})
 
 
 def test_a_segway_by_its_speed_and_its_rate_of_turn_stays_upright_and_exact():
@@ -286,7 +285,7 @@ def test_an_angle_that_matters_in_motion_is_no_integral():
     x, theta = q
     tip = ca.vertcat(x + ca.cos(theta), ca.sin(theta))
     mechanism = sv.Mechanism(q, sv.particle(q, 2.0, x) + sv.particle(q, 1.0, tip), actuators={"F": x})
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.5, smoothness=4)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, 1.5, smoothness=4)).X
     found = verdict(sv.derive(mechanism, sv.Program({"X": x - path})))
     assert found.word == "marginal" and "constant" not in found.reason
 
@@ -298,7 +297,7 @@ def over_a_hill(v, ranges, centre=0.5, **options):
     """A point that moves along a line over a hill, or around it by a bow v."""
     p, q = sv.parameters(v=v), sv.coordinates("x y")
     x, y = q
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0, smoothness=4)
+    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 2.0, smoothness=4)).s
     mechanism = sv.Mechanism(
         q, sv.particle(q, 1.0, ca.vertcat(x, y)), potential=30 * ca.exp(-((x - centre) ** 2 + y**2) / 0.02),
         actuators={"F": x, "G": y}, parameters=p,
@@ -339,7 +338,7 @@ def test_a_design_leaves_a_stationary_point_for_less_cost(case):
 def test_a_least_cost_of_zero_is_a_minimum(first, minimise):
     p, q = sv.parameters(a=first), sv.coordinates("x")
     (x,) = q
-    way = (p.a - 0.1) * sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0, smoothness=4)
+    way = (p.a - 0.1) * q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 2.0, smoothness=4)).s
     model = sv.derive(sv.Mechanism(q, sv.particle(q, 1.0, x), actuators={"F": x}, parameters=p), sv.Program({"X": x - way}))
     found = sv.design(model, {"a": (-1.0, 1.0)}, (0.0, 2.0), minimise)
     assert "a local minimum" in found.message and found.values["a"] == pytest.approx(0.1, abs=1e-7)

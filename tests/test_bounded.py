@@ -27,7 +27,7 @@ def arm(Gamma, duration=2.0, **numbers):
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=p.c * q2**2 / 2, forces={"q2": -p.d * dq2}, actuators={"torque": q1}, parameters=p
     )
-    path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=duration, smoothness=4)
+    path = q.references(angle=sv.paths.rest_to_rest(0.0, pi / 2, duration=duration, smoothness=4)).angle
     return sv.derive(mechanism, sv.Program({"angle": q1 + p.Gamma * q2 - path})).with_parameters(**numbers)
 
 
@@ -35,8 +35,9 @@ def aircraft():
     """The centre of mass of the gallery's aircraft, from (0, 0) to (10, 5) m in 3 s."""
     mechanism, _ = gallery["vtol-centre"].build()
     x, z, _ = mechanism.q
-    path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (10.0, 5.0), duration=3.0, smoothness=4)
-    return sv.derive(mechanism, sv.Program({"X": x - path[0], "Z": z - path[1]}))
+    path = sv.paths.rest_to_rest((0.0, 0.0), (10.0, 5.0), duration=3.0, smoothness=4)
+    r = mechanism.q.references(across=path[0], up=path[1])
+    return sv.derive(mechanism, sv.Program({"X": x - r.across, "Z": z - r.up}))
 
 
 def flexible_link(n, m=0.1, l=0.15, k=60.0, d=0.05, J=0.05):
@@ -50,7 +51,7 @@ def flexible_link(n, m=0.1, l=0.15, k=60.0, d=0.05, J=0.05):
     dampers = {f"q{i}": -d * q.d(1)[i] for i in range(1, n)}
     springs = sum(k * angle**2 / 2 for angle in joints)
     mechanism = sv.Mechanism(q, gibbs=S, potential=springs, forces=dampers, actuators={"hub": hub})
-    path = sv.paths.rest_to_rest(q.t, 0.0, 0.5, 1.5, t_start=0.3)
+    path = q.references(tip=sv.paths.rest_to_rest(0.0, 0.5, 1.5, t_start=0.3)).tip
     return mechanism, sv.Program({"tip": sum(angles) / n - path})
 
 
@@ -62,12 +63,13 @@ def cart_pole(path, start=0.0, damping=0.0):
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=0.2 * 9.81 * 0.5 * ca.cos(a), forces={"a": -damping * q.d(1)[1]}, actuators={"F": x}
     )
-    model = sv.derive(mechanism, sv.Program({"x": x - path(q.t)}))
+    model = sv.derive(mechanism, sv.Program({"x": x - path(q)}))
     return model, model.start(a=start, da=0.0)
 
 
 def step(duration=1.0):
-    return lambda t: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=duration, smoothness=4)
+    path = sv.paths.rest_to_rest(0.0, 1.0, duration=duration, smoothness=4)
+    return lambda q: q.references(x=path).x
 
 
 def test_the_passive_arm_of_known_numbers():
@@ -101,12 +103,11 @@ def test_a_general_solver_finds_the_same_motion():
 
     model, start = cart_pole(step())
     run = sv.simulate(model, start, (0.0, 1.0), sv.methods.Bounded())
-    t = ca.SX.sym("t")
-    jerk = ca.Function("a", [t], [ca.jacobian(ca.jacobian(step()(t), t), t)])
+    path = sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=4)
     rate = np.sqrt(9.81 / 0.5)
 
     def rates(t, y):
-        return np.array([y[1], (9.81 * np.sin(y[0]) - np.array(jerk(t[None])).ravel() * np.cos(y[0])) / 0.5])
+        return np.array([y[1], (9.81 * np.sin(y[0]) - path.jets(t, 2)[2, 0] * np.cos(y[0])) / 0.5])
 
     def ends(left, right):  # the stable component is zero before the program, the unstable one after it
         return np.array([left[1] - rate * left[0], right[1] + rate * right[0]])
@@ -159,7 +160,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing():
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=0.2 * 9.81 * Z, actuators={"F": x}, constraints={"rod": (X - x) ** 2 + Z**2 - 0.25}
     )
-    absolute = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}), guess={"Z": 0.5})
+    absolute = sv.derive(mechanism, sv.Program({"x": x - step()(q)}), guess={"Z": 0.5})
     run = sv.simulate(absolute, absolute.start(guess={"Z": 0.5}), (0.0, 1.0), sv.methods.Bounded(), t_eval=expected.t)
     assert run["X"] == pytest.approx(expected["x"] + 0.5 * np.sin(expected["a"]), abs=1e-9)
     assert run["F"] == pytest.approx(expected["F"], abs=1e-7)
@@ -167,7 +168,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing():
     x, a = q
     S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
     mechanism = sv.Mechanism(q, gibbs=S, potential=0.2 * 9.81 * 0.5 * ca.cos(a), actuators={"F": x})
-    other = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    other = sv.derive(mechanism, sv.Program({"x": x - step()(q)}))
     run = sv.simulate(other, other.start(guess={"a": 0.0}), (0.0, 1.0), sv.methods.Bounded(), t_eval=expected.t)
     assert run["a"] == pytest.approx(expected["a"], abs=1e-9) and run["F"] == pytest.approx(expected["F"], abs=1e-7)
 
@@ -235,17 +236,17 @@ def test_bounded_plans_in_a_sweep():
 
 
 def masses(forces, residual):
-    """Masses of 1 kg at x, y and z under forces(x, v), of which an actuator moves the first by residual(t, x, v, a)."""
+    """Masses of 1 kg at x, y and z under forces(x, v), of which an actuator moves the first by residual(q, x, v, a)."""
     q = sv.coordinates("x y z")
     x, v, a = tuple(q), tuple(q.d(1)), tuple(q.d(2))
     S = sv.particle(q, 1.0, x[0]) + sv.particle(q, 1.0, x[1]) + sv.particle(q, 1.0, x[2])
     mechanism = sv.Mechanism(q, S, actuators={"F": x[0]}, forces=ca.vertcat(0, *forces(x, v)))
-    return sv.derive(mechanism, sv.Program({"x": residual(q.t, x, v, a)}))
+    return sv.derive(mechanism, sv.Program({"x": residual(q, x, v, a)}))
 
 
-def follows(t, x, v, a):
+def follows(q, x, v, a):
     """x follows the path of `step()`."""
-    return x[0] - step()(t)
+    return x[0] - step()(q)
 
 
 def convolved(path, rate, t):
@@ -285,7 +286,7 @@ def test_a_program_of_accelerations_has_no_invariants():
     """x'' + 3 x' + 2 x = 2 path leaves the whole state free, one eigenvalue of which is unstable."""
     model = masses(
         lambda x, v: (4 * x[1] + x[0], -x[2] - v[2]),
-        lambda t, x, v, a: a[0] + 3 * v[0] + 2 * x[0] - 2 * step()(t),
+        lambda q, x, v, a: a[0] + 3 * v[0] + 2 * x[0] - 2 * step()(q),
     )
     run = sv.simulate(model, model.start(), (0.0, 1.0), sv.methods.Bounded())
     assert not invariant_names(model) and sv.verify(run).passed
@@ -295,7 +296,7 @@ def test_a_program_of_accelerations_has_no_invariants():
 
 
 def test_accelerations_that_leave_an_oscillation_are_marginal():
-    model = masses(lambda x, v: (-x[1], -x[2]), lambda t, x, v, a: a[0] - ca.sin(t))
+    model = masses(lambda x, v: (-x[1], -x[2]), lambda q, x, v, a: a[0] - ca.sin(q.t))
     assert sv.report(model).verdict == "marginal"
     with refused(UnstableInternalDynamics, "imaginary axis"):
         sv.simulate(model, model.start(), (0.0, 1.0), sv.methods.Bounded())
@@ -345,10 +346,10 @@ def test_rolling_as_a_constraint_of_velocities_has_the_motion_of_its_integral():
     x, phi, a = q
     S = sv.particle(q, 2.0, (x, 0)) + sv.particle(q, 1.0, (x + 0.7 * ca.sin(a), 0.7 * ca.cos(a)))
     S += sv.rigid_body(q, 1e-4, (0, 0, 0.05), position=ca.vertcat(x, 0), rates=(0, 0, q.d(1)[1]))
-    runs, U = [], 9.81 * 0.7 * ca.cos(a)
+    runs, U, to = [], 9.81 * 0.7 * ca.cos(a), step()(q)
     for roll in (q.d(1)[0] - 0.2 * q.d(1)[1], x - 0.2 * phi):
         mechanism = sv.Mechanism(q, gibbs=S, potential=U, constraints={"roll": roll}, actuators={"T": phi})
-        model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+        model = sv.derive(mechanism, sv.Program({"x": x - to}))
         runs.append(sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.methods.Bounded()))
         values = Problem(model, (0.0, 1.0), runs[-1].start.values).first.modes.eigenvalues
         assert values == pytest.approx([(9.81 / 0.7) ** 0.5, -((9.81 / 0.7) ** 0.5)], abs=1e-9)
@@ -363,12 +364,12 @@ def test_ends_that_differ_in_their_unstable_modes_are_refused():
     S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
     U = 0.2 * 9.81 * 0.5 * ca.cos(a) + (1 - x) * 5.0 * a**2 / 2
     mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces={"a": -0.2 * q.d(1)[1]}, actuators={"F": x})
-    model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    model = sv.derive(mechanism, sv.Program({"x": x - step()(q)}))
     with refused(UnstableInternalDynamics, unstable=[0, 1]):
         sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.methods.Bounded())
 
 
-@pytest.mark.parametrize("path, end", [(lambda t: ca.sin(3 * t), 1.0), (step(), 0.6)], ids=["oscillates", "cut short"])
+@pytest.mark.parametrize("path, end", [(lambda q: ca.sin(3 * q.t), 1.0), (step(), 0.6)], ids=["oscillates", "cut short"])
 def test_a_program_that_does_not_stand_still_outside_its_span_is_refused(path, end):
     model, start = cart_pole(path)
     with refused(SpecificationError, "stands still", span=(0.0, end)):
@@ -381,7 +382,7 @@ def test_switches_of_the_state_are_refused():
     S = sv.particle(q, 1.0, (x, 0)) + sv.particle(q, 0.2, (x + 0.5 * ca.sin(a), 0.5 * ca.cos(a)))
     U = 0.2 * 9.81 * 0.5 * ca.cos(a)
     mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces={"a": -0.1 * ca.sign(q.d(1)[1])}, actuators={"F": x})
-    model = sv.derive(mechanism, sv.Program({"x": x - step()(q.t)}))
+    model = sv.derive(mechanism, sv.Program({"x": x - step()(q)}))
     with refused(SpecificationError, "kinks or switches"):
         sv.simulate(model, model.start(a=0.0, da=0.0), (0.0, 1.0), sv.methods.Bounded())
 

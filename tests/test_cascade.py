@@ -286,7 +286,7 @@ def test_residuals_of_hidden_rows_are_those_of_the_motion(pairs):
     assert names == by_expressions.signals("residuals")[0]
     wrong = run.jets.copy()
     wrong[3] += 1e-3  # the car's place, which its hidden row determines
-    values = [np.abs(function.grid(run.t, jets, by_blocks.parameters)).max() for jets in (run.jets, wrong)]
+    values = [np.abs(function.grid(run.t, jets, by_blocks.p)).max() for jets in (run.jets, wrong)]
     assert values[0] < 1e-8 < 1e-4 < values[1]
 
 

@@ -39,9 +39,9 @@ def scene():
     q = sv.coordinates("x y")
     x, y = q
     S = sv.particle(q, p.m, x) + sv.particle(q, p.m, y)
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=2)
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=2))
     mechanism = sv.Mechanism(q, gibbs=S, potential=p.m * p.g * y, actuators={"push": x}, parameters=p)
-    return mechanism, sv.Program({"X": x - path})
+    return mechanism, sv.Program({"X": x - r.X})
 '''
 
 

@@ -23,8 +23,9 @@ def standing(duration=1.0, **options):
         potential=p.g * (p.foot * z + p.body * (z + h)), parameters=p, actuators={"side": s, "lift": h},
         constraints={"sole_x": x, "sole_z": z},
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.5), end=(0.6, 0.7), duration=duration, smoothness=4)
-    program = sv.Program({"S": s - path[0], "H": h - path[1]}, by="actuators")
+    path = sv.paths.rest_to_rest(start=(0.0, 0.5), end=(0.6, 0.7), duration=duration, smoothness=4)
+    r = q.references(S=path[0], H=path[1])
+    program = sv.Program({"S": s - r.S, "H": h - r.H}, by="actuators")
     model = sv.derive(mechanism, program)
     return sv.simulate(model, model.start(0.0, guess={"h": 0.5}), (0.0, duration), **options), sv.plant(mechanism)
 

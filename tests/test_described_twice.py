@@ -52,7 +52,7 @@ def test_inertia_in_a_force_reaches_plan_plant_and_loop(case):
     q, m = robot.q, make(robot)
     plant = sv.plant(m)
     assert plant.rates(0.0, [np.pi / 2, 0.0], [1.0])[1] == pytest.approx(1 / 0.76, rel=1e-12)  # hangs
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=3)
+    path = q.references(J=sv.paths.rest_to_rest(0.0, 1.0, 1.0, smoothness=3)).J
     model = sv.derive(m, sv.Program({"J": q["ja"] - path}))
     plan = sv.simulate(model, model.start(), (0.0, 1.0))
     by_hand = 0.76 * plan["d2ja"] - 0.5 * 9.81 * np.cos(plan["ja"])
@@ -321,7 +321,7 @@ def torque(crank, rocker):
     assert len(rows) == 2
     model = sv.derive(
         robot.mechanism(rows, actuators=("a",)),
-        sv.Program({"A": robot.q["a"] - 0.5 - sv.paths.rest_to_rest(robot.q.t, 0.0, 1.0, 1.0)}),
+        sv.Program({"A": robot.q["a"] - 0.5 - robot.q.references(A=sv.paths.rest_to_rest(0.0, 1.0, 1.0)).A}),
     )
     return sv.simulate(model, model.start(guess={"a": 0.5, "ja": 0.5, "c": 1.5}), (0.0, 1.0))["torque_a"]
 
@@ -353,6 +353,6 @@ def test_the_constant_of_rolling_is_named_with_quasi_velocities(V):
     m = sv.Mechanism(
         moved, S, 9.81 * 0.6 * ca.cos(a), {"T": phi - a}, constraints={"roll": dx - 0.2 * dphi}
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(plain.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    path = plain.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=4)).X
     found = sv.report(sv.derive(m, sv.Program({"X": x - path})))
     assert "0 is the constant of phi" in found.reason

@@ -22,18 +22,18 @@ def curve(times, points, k):
     return make_interp_spline(times, np.asarray(points, dtype=float), k=2 * k + 1, bc_type=(rest, rest))
 
 
-def mass(path, **values):
-    """A driven mass, of which x follows path(t, p)."""
+def mass(path, scale=lambda p: 1.0, **values):
+    """A driven mass, of which x follows scale(p) times path(p)."""
     p = sv.parameters(m=2.0, **values)
     q = sv.coordinates("x")
     (x,) = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"push": x}, parameters=p)
-    return sv.derive(mechanism, sv.Program({"X": x - path(q.t, p)})), p
+    return sv.derive(mechanism, sv.Program({"X": x - scale(p) * q.references(X=path(p)).X})), p
 
 
 def through(times=(0.0, 0.8, 2.0), smoothness=2):
     """From 0 to 1 m through a via point."""
-    return mass(lambda t, p: sv.paths.spline(t, times, [0.0, p.via, 1.0], smoothness), via=0.9)
+    return mass(lambda p: sv.paths.spline(times, [0.0, p.via, 1.0], smoothness=smoothness), via=0.9)
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +46,10 @@ def crane():
     S = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load)
     potential = -p.m_load * p.g * load[1]
     mechanism = sv.Mechanism(q, S, potential=potential, actuators={"trolley": x, "hoist": l}, parameters=p)
-    path = sv.paths.spline(q.t / p.T, [0.0, 0.5, 1.0], [[0.0, 4.0], [p.via_x, p.via_z], [5.0, 2.0]], smoothness=4)
-    return sv.derive(mechanism, sv.Program({"X": load[0] - path[0], "Z": load[1] - path[1]})), p
+    points = [[0.0, 4.0], [p.via_x, p.via_z], [5.0, 2.0]]
+    path = sv.paths.spline([0.0, 0.5 * p.T, p.T], points, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
+    return sv.derive(mechanism, sv.Program({"X": load[0] - r.X, "Z": load[1] - r.Z})), p
 
 
 def crane_forces(via_x, via_z, T=6.0, t=None):
@@ -70,8 +72,9 @@ def aircraft():
     }
     body = sv.rigid_body(q, p.M, (0, 0, p.J), position=(x, z), rates=(0, 0, q.d(1)[2]))
     mechanism = sv.Mechanism(q, gibbs=body, potential=p.M * p.g * z, actuators=thrust, parameters=p)
-    path = sv.paths.spline(q.t / p.T, [0.0, 0.5, 1.0], [[0.0, 0.0], [2.5, p.via], [5.0, 2.0]], smoothness=4)
-    return sv.derive(mechanism, sv.Program({"X": x - path[0], "Z": z - path[1]})), p
+    path = sv.paths.spline([0.0, 0.5 * p.T, p.T], [[0.0, 0.0], [2.5, p.via], [5.0, 2.0]], smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
+    return sv.derive(mechanism, sv.Program({"X": x - r.X, "Z": z - r.Z})), p
 
 
 def hanging():
@@ -85,8 +88,8 @@ def hanging():
     mechanism = sv.Mechanism(
         q, S, potential=p.m * p.g * bob[1], forces=forces, actuators={"pull": x}, parameters=p
     )  # fmt: skip
-    path = sv.paths.spline(q.t / p.T, [0.0, 0.5, 1.0], [0.0, p.via, 1.0], smoothness=3)
-    return sv.derive(mechanism, sv.Program({"X": x - path})), p
+    r = q.references(X=sv.paths.spline([0.0, 0.5 * p.T, p.T], [0.0, p.via, 1.0], smoothness=3))
+    return sv.derive(mechanism, sv.Program({"X": x - r.X})), p
 
 
 def wheel_on_a_line():
@@ -97,8 +100,8 @@ def wheel_on_a_line():
     mechanism = sv.Mechanism(
         q, kinetic=1.5 * p.m * (p.r * spin) ** 2 / 2, forces={"spin": -(spin**3)}, actuators={"motor": [1.0]}, parameters=p
     )  # fmt: skip
-    path = sv.paths.spline(q.t / p.T, [0.0, 0.5, 1.0], [0.0, p.via, 1.0], smoothness=3)
-    return sv.derive(mechanism, sv.Program({"X": list(q)[0] - path})), p
+    r = q.references(X=sv.paths.spline([0.0, 0.5 * p.T, p.T], [0.0, p.via, 1.0], smoothness=3))
+    return sv.derive(mechanism, sv.Program({"X": list(q)[0] - r.X})), p
 
 
 # closed forms --------------------------------------------------------------------------------------------------------
@@ -135,7 +138,7 @@ def test_the_via_point_of_least_peak_is_that_of_a_fine_grid():
 @pytest.mark.parametrize("first", [3.0, 9.0])
 def test_the_duration_under_a_force_limit_is_the_closed_form(first):
     """S7 over d in T needs m d c/T², c = max |S''|: from a duration that is too short, or too long."""
-    model, p = mass(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 3.0, p.T, smoothness=3), T=first)
+    model, p = mass(lambda p: sv.paths.rest_to_rest(0.0, 3.0, p.T, smoothness=3), T=first)
     found = sv.design(model, {"T": (1.0, 20.0)}, (0.0, p.T), "time", limits={"push": 4.0})
     c = np.abs(known.blend(np.linspace(0.0, 1.0, 200_001), 2, 3)).max()
     assert found.cost == found.values["T"] == pytest.approx(np.sqrt(2.0 * 3.0 * c / 4.0), rel=1e-6)
@@ -146,7 +149,7 @@ def test_the_duration_under_a_force_limit_is_the_closed_form(first):
 
 def test_the_instant_of_a_via_point_is_a_parameter():
     """Each time of a via point has a rms; its least one by scipy's splines and scalar minimisation."""
-    model, _ = mass(lambda t, p: sv.paths.spline(t, [0.0, p.when, 2.0], [0.0, 0.3, 1.0]), when=1.4)
+    model, _ = mass(lambda p: sv.paths.spline([0.0, p.when, 2.0], [0.0, 0.3, 1.0]), when=1.4)
     found = sv.design(model, {"when": (0.3, 1.7)}, (0.0, 2.0))
     x, w = np.polynomial.legendre.leggauss(20)
 
@@ -276,9 +279,9 @@ def arm():
     """The model of this arm; its reach is 1.1 m."""
     mechanism, _ = two_link_arm()
     mechanism.parameters = p = mechanism.parameters.extended(vx=0.5, vy=0.6)
-    path = sv.paths.spline(mechanism.q.t, [0.0, 0.5, 1.0], [[0.6, 0.4], [p.vx, p.vy], [0.2, 0.9]], smoothness=2)
-    ends = mechanism.outputs
-    return sv.derive(mechanism, sv.Program({"X": ends["X_end"] - path[0], "Y": ends["Y_end"] - path[1]}))
+    path = sv.paths.spline([0.0, 0.5, 1.0], [[0.6, 0.4], [p.vx, p.vy], [0.2, 0.9]], smoothness=2)
+    r, ends = mechanism.q.references(via_x=path[0], via_y=path[1]), mechanism.outputs
+    return sv.derive(mechanism, sv.Program({"X": ends["X_end"] - r.via_x, "Y": ends["Y_end"] - r.via_y}))
 
 
 def test_the_via_point_of_least_peak_torque_is_that_of_a_grid(arm):
@@ -309,15 +312,18 @@ def test_a_search_goes_round_parameters_without_a_motion(monkeypatch):
             raise
 
     monkeypatch.setattr(Search, "at", recorded)
-    model, _ = mass(lambda t, p: (1 + (ca.sqrt(p.via - 0.5) - 0.1) ** 2) * sv.paths.rest_to_rest(t, 0, 1, 2.0), via=2.0)
+    model, _ = mass(lambda p: sv.paths.rest_to_rest(0, 1 + (ca.sqrt(p.via - 0.5) - 0.1) ** 2, 2.0), via=2.0)
     found = sv.design(model, {"via": (-5.0, 5.0)}, (0.0, 2.0))
     assert missed and found.proof.passed and found.values["via"] == pytest.approx(0.51, abs=1e-5)
 
 
 def test_parameters_without_a_motion_at_the_start_are_refused():
-    model, _ = mass(lambda t, p: ca.sqrt(p.via - 0.5) * sv.paths.rest_to_rest(t, 0, 1, 2.0), via=2.0)
+    model, _ = mass(lambda p: sv.paths.rest_to_rest(0, 1, 2.0), lambda p: ca.sqrt(p.via - 0.5), via=2.0)
     with refused(sv.errors.InconsistentStart):
         sv.design(model.with_parameters(via=0.4), {"via": (-5.0, 5.0)}, (0.0, 2.0))
+    model, _ = mass(lambda p: sv.paths.rest_to_rest(0, ca.sqrt(p.via - 0.5), 2.0), via=2.0)
+    with refused(sv.errors.SpecificationError):
+        model.with_parameters(via=0.4)
 
 
 # bounded and forward motions, ideal programs --------------------------------------------------------------------------
@@ -354,9 +360,9 @@ def test_ideal_programs_are_designed_by_their_reaction():
     q = sv.coordinates("x")
     p = sv.parameters(via=0.9)
     (x,) = q
-    path = sv.paths.spline(q.t, (0.0, 1.0, 2.0), [0.0, p.via, 1.0])
+    r = q.references(X=sv.paths.spline((0.0, 1.0, 2.0), [0.0, p.via, 1.0]))
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), parameters=p)
-    model = sv.derive(mechanism, sv.Program({"X": x - path}, by="ideal"))
+    model = sv.derive(mechanism, sv.Program({"X": x - r.X}, by="ideal"))
     found = sv.design(model, {"via": (0.0, 1.0)}, (0.0, 2.0))
     assert found.values["via"] == pytest.approx(0.5, abs=1e-9) and found.proof.passed
 
@@ -385,7 +391,9 @@ def test_units_and_the_begin_of_the_span_do_not_matter():
     """Millimetres and milliseconds; from 1 to 1 + T, with dwells before and after it; by symmetry through 0.5."""
     u, s = 1e3, 1e-3
     model, p = mass(
-        lambda t, p: sv.paths.spline((t - s) / p.T, [0.0, 0.5, 1.0], [0.0, p.via, u], smoothness=3), T=3.0 * s, via=0.6 * u
+        lambda p: sv.paths.spline(s + p.T * np.array([0.0, 0.5, 1.0]), [0.0, p.via, u], smoothness=3),
+        T=3.0 * s,
+        via=0.6 * u,
     )
     ranges, span = {"T": (s, 20.0 * s), "via": (0.0, u)}, (0.5 * s, 1.5 * s + p.T)
     found = sv.design(model, ranges, span, "time", limits={"push": 4.0 * u / s**2})
@@ -411,7 +419,7 @@ def test_a_design_is_a_value_with_its_model_and_plan():
 
 
 def test_a_kink_at_the_minimum_is_not_called_one():
-    model, _ = mass(lambda t, p: (1.0 + ca.fabs(p.via)) * sv.paths.rest_to_rest(t, 0.0, 1.0, 2.0, 2), via=0.9)
+    model, _ = mass(lambda p: (1.0 + ca.fabs(p.via)) * sv.paths.rest_to_rest(0.0, 1.0, 2.0, smoothness=2), via=0.9)
     with warned("inconclusive"):
         found = sv.design(model, {"via": (-1.0, 2.0)}, (0.0, 2.0))
     assert "inconclusive" in found.message and found.cost <= found.before
@@ -424,8 +432,8 @@ def test_a_force_that_jumps_between_knots_is_integrated():
     (x,) = q
     load = {"x": -2.5 * (1 + ca.tanh((q.t - 1.0) / 1e-6))}
     mechanism = sv.Mechanism(q, sv.particle(q, 1.0, x), forces=load, actuators={"push": x}, parameters=p)
-    path = sv.paths.spline(q.t, (0.0, 0.8, 2.0), [0.0, p.via, 1.0])
-    found = sv.design(sv.derive(mechanism, sv.Program({"X": x - path})), {"via": (-2.0, 2.0)}, (0.0, 2.0))
+    r = q.references(X=sv.paths.spline((0.0, 0.8, 2.0), [0.0, p.via, 1.0]))
+    found = sv.design(sv.derive(mechanism, sv.Program({"X": x - r.X})), {"via": (-2.0, 2.0)}, (0.0, 2.0))
     t = (np.arange(200_000) + 0.5) * 1e-5
     a, b = (curve((0.0, 0.8, 2.0), points, 2)(t, nu=2) for points in ((0, 0, 1), (0, 1, 0)))
     via = -((a + 5.0 * (t > 1.0)) @ b) / (b @ b)

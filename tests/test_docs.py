@@ -89,6 +89,7 @@ def test_the_shell_commands_of_the_pages_are_valid(page, command):
 
 TOOLS = {
     "servoctl": "servoctl",
+    "SciPy": "scipy",
     "SymPy": "sympy.physics.mechanics",
     "Pinocchio": "pinocchio",
     "Drake": "pydrake.all",

@@ -62,11 +62,12 @@ def test_every_method_moves_a_plant(machine, method):
         assert sv.verify(run).passed
 
 
+PUSH = sv.paths.rest_to_rest(0.0, 3.0, 1.5)
 FORCES = {
-    "number": (lambda t: -1.5, lambda t: -1.5),
-    "function": (lambda t: lambda s: 2 * s - ca.cos(s), lambda t: 2 * t - np.cos(t)),
-    "path": (lambda t: sv.paths.rest_to_rest(t, 0.0, 3.0, 1.5), None),
-    "none": (lambda t: None, lambda t: 0.0),
+    "number": (lambda q: -1.5, lambda t: -1.5),
+    "function": (lambda q: lambda t: 2 * t - ca.cos(t), lambda t: 2 * t - np.cos(t)),
+    "path": (lambda q: q.references(push=PUSH).push, PUSH),
+    "none": (lambda q: None, lambda t: 0.0),
 }
 
 
@@ -74,11 +75,7 @@ FORCES = {
 @pytest.mark.parametrize("kind", FORCES)
 def test_inputs_are_numbers_expressions_paths_or_functions(machine, kind):
     make, force = FORCES[kind]
-    t = machine.mechanism.q.t
-    value = make(t)
-    if force is None:
-        f = ca.Function("f", [t], [ca.SX(value)])
-        force = lambda s: float(f(s))  # noqa: E731
+    value = make(machine.mechanism.q)
     inputs = {} if value is None else {"trolley": value}
     run = sv.simulate(machine, [*START.values()], (0.0, 2.0), inputs=inputs)
     assert ends(run) == pytest.approx(reference(machine, force), abs=1e-7)
@@ -174,7 +171,7 @@ def test_outputs_of_higher_order_in_a_closed_loop(crane):
     model = sv.derive(
         sv.Mechanism(crane.q, gibbs=crane._gibbs, potential=crane.potential, parameters=crane.parameters,
                      actuators={"trolley": list(crane.q)[0]}),
-        sv.Program({"x": list(crane.q)[0] - sv.paths.rest_to_rest(crane.q.t, 0.0, 1.0, 2.0)}),
+        sv.Program({"x": list(crane.q)[0] - crane.q.references(x=sv.paths.rest_to_rest(0.0, 1.0, 2.0)).x}),
     )  # fmt: skip
     plan = sv.simulate(model, model.start(theta=0.1, dtheta=0.0), (0.0, 2.0), t_eval=np.linspace(0, 2, 201))
     plant = sv.plant(crane)
@@ -206,6 +203,7 @@ def test_a_plant_of_one_coordinate_moves():
 def test_a_parameter_may_have_the_name_of_an_option(name):
     q, p = sv.coordinates("x"), sv.parameters(**{name: 2.0})
     mechanism = sv.Mechanism(q, sv.particle(q, getattr(p, name), q["x"]), actuators={"F": q["x"]}, parameters=p)
-    program = sv.Program({"path": q["x"] - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=2)})
+    r = q.references(path=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=2))
+    program = sv.Program({"path": q["x"] - r.path})
     run = sv.relaxed(sv.plant(mechanism), program, (0.0, 1.0))
     assert np.abs(run["F"]).max() == pytest.approx(2.0 * 10 / np.sqrt(3), rel=0.05)  # of the quintic

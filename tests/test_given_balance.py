@@ -71,7 +71,7 @@ def test_a_given_balance_has_the_relaxed_plan_of_its_machine():
     S = sv.particle(q, 2.5, x) + sv.particle(q, 60.0, load)
     crane = sv.Mechanism(q, S, potential=60 * 9.81 * load[1], actuators={"f": x})
     given = sv.Mechanism(q, balance=crane.balance, actuators={"f": x})
-    path = sv.paths.rest_to_rest(q.t, 0.0, 3.0, duration=6.0, smoothness=4)
+    path = q.references(load=sv.paths.rest_to_rest(0.0, 3.0, duration=6.0, smoothness=4)).load
     program = sv.Program({"load": load[0] - path})
     plan, other = (sv.relaxed(sv.plant(each), program, (0.0, 6.0)) for each in (crane, given))
     assert np.abs(plan["f"] - other["f"]).max() < 1e-9 * np.abs(plan["f"]).max()

@@ -98,7 +98,7 @@ def _bodies(q, v, l=0.5):
 def test_bodies_agree_with_the_dense_equations(n, model):
     q, v = np.random.default_rng(n).uniform(-1.0, 1.0, (2, n))
     expected, force = _chain(q, v)
-    y = model(n).function("accelerations")(0.0, _bodies(q, v), model(n).parameters)
+    y = model(n).function("accelerations")(0.0, _bodies(q, v), model(n).p)
     rates = np.diff(y[2 : 3 * n : 3], prepend=0.0)
     assert np.abs(rates - expected).max() < 1e-10 * np.abs(expected).max()
     assert np.abs(y[3 * n : 3 * n + 2] - force).max() < 1e-10 * np.abs(force).max()
@@ -109,11 +109,11 @@ def test_joint_angles_agree_with_the_dense_equations(n, model):
     model = model(n, "joints")
     q, v = np.random.default_rng(n).uniform(-1.0, 1.0, (2, n))
     expected, force = _chain(q, v)
-    y = model.function("accelerations")(0.0, np.concatenate([q, v]), model.parameters)
+    y = model.function("accelerations")(0.0, np.concatenate([q, v]), model.p)
     scale = np.abs(expected).max()
     assert np.abs(y[:n] - expected).max() < 1e-9 * scale
     assert np.abs(y[n:] - force).max() < 1e-9 * np.abs(force).max()
-    rates = model.function("ode")(0.0, np.concatenate([q, v]), model.parameters)[n : 2 * n]
+    rates = model.function("ode")(0.0, np.concatenate([q, v]), model.p)[n : 2 * n]
     assert np.abs(rates - expected).max() < 1e-9 * scale
 
 
@@ -122,8 +122,8 @@ def test_spatial_bodies_agree_with_joint_angles():
     joints, bodies = (derive(*spatial_arm(n, c)) for c in ("joints", "bodies"))
     q, v = np.random.default_rng(1).uniform(-1.0, 1.0, (2, n))
     held = {f"theta{i + 1}": q[i] for i in range(n)} | {f"dtheta{i + 1}": v[i] for i in range(n)}
-    expected = joints.function("accelerations")(0.0, np.concatenate([q, v]), joints.parameters)
-    y = bodies.function("accelerations")(0.0, bodies.start(**held).values, bodies.parameters)
+    expected = joints.function("accelerations")(0.0, np.concatenate([q, v]), joints.p)
+    y = bodies.function("accelerations")(0.0, bodies.start(**held).values, bodies.p)
     assert np.abs(y[: 7 * n : 7] - expected[:n]).max() < 1e-10 * np.abs(expected).max()
     assert np.abs(y[7 * n : 7 * n + 3] - expected[n:]).max() < 1e-10 * np.abs(expected).max()
 

@@ -28,11 +28,12 @@ def crane(count=0, upright=False, motors=False, outputs=None, coupling=0.0):
         S += sv.particle(q, m, ca.vertcat(ca.sin(phi), side * ca.cos(phi)))
         U -= m * p.g * side * ca.cos(phi)
     U += coupling * sum((phi - theta) ** 2 for phi in others) / 2
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 4.0), end=(5.0, 2.0), duration=6.0, smoothness=4)
+    path = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(5.0, 2.0), duration=6.0, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
     actuators = {"trolley": x, "hoist": l} | ({f"motor{i}": phi for i, phi in enumerate(others)} if motors else {})
     reported = {name: others[int(name[-1])] for name in outputs or ()}
     mechanism = sv.Mechanism(q, gibbs=S, potential=U, actuators=actuators, parameters=p, outputs=reported)
-    return mechanism, sv.Program({"X": load[0] - path[0], "Z": load[1] - path[1]})
+    return mechanism, sv.Program({"X": load[0] - r.X, "Z": load[1] - r.Z})
 
 
 def planned(model):
@@ -96,8 +97,9 @@ def test_two_of_twenty_pendulums_are_a_flat_plan():
     mechanism = sv.Mechanism(
         q, gibbs=S / 2, potential=-9.81 * sum(map(ca.cos, q)), actuators={"m0": q.d(0)[0], "m1": q.d(0)[1]}
     )
-    targets = [sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4) * k for k in (1, 2)]
-    program = sv.Program({"A": q.d(0)[0] - targets[0], "B": q.d(0)[1] - targets[1]})
+    path = sv.paths.rest_to_rest((0.0, 0.0), (1.0, 2.0), duration=2.0, smoothness=4)
+    r = q.references(A=path[0], B=path[1])
+    program = sv.Program({"A": q.d(0)[0] - r.A, "B": q.d(0)[1] - r.B})
     model = sv.derive(mechanism, program)
     assert model.flat and model.reduction.mechanism.q.names == ("a0", "a1") and len(model.reduction.left_out) == 18
     run = sv.simulate(model, model.start(), (0.0, 2.0))

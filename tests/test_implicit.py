@@ -120,11 +120,11 @@ def test_stiff_spring_against_scipy(stiff):
     model, start, _ = stiff
     f, slopes, n = model.function("ode"), model.function("ode_jacobian"), len(start.values)
     reference = solve_ivp(
-        lambda t, x: f(t, x, model.parameters)[:n],
+        lambda t, x: f(t, x, model.p)[:n],
         (0.0, 1.0),
         start.values,
         method=Radau,
-        jac=lambda t, x: slopes(t, x, model.parameters).reshape(n, n).T,
+        jac=lambda t, x: slopes(t, x, model.p).reshape(n, n).T,
         rtol=1e-7,
         atol=1e-9,
     )
@@ -162,7 +162,7 @@ def test_projection_keeps_the_constraints_and_poles_keep_the_motion(model, start
 def residuals(run):
     model = run.model
     f, m = model.function("invariants"), len(invariant_names(model))
-    return f.grid(run.t, run.jets[: len(model.state_names)], model.parameters)[:m]
+    return f.grid(run.t, run.jets[: len(model.state_names)], model.p)[:m]
 
 
 def test_backwards(model, start):

@@ -12,14 +12,15 @@ import servoctl as sv
 
 HOME = dict(zip((f"joint_{i}" for i in range(1, 8)), (0.2, 0.5, 0.1, 1.6, 0.2, 1.3, 0.1), strict=True))
 LEG = {"front_hip": 0.5, "front_knee": -1.0, "front_ankle": 0.3}
+MOVE = sv.paths.rest_to_rest(0.0, 1.0, 2.0)
 
 
 @lru_cache
 def arm_and_pose():
     arm = sv.urdf(robots.file_of("seven_axis_arm"))
     position, rotation = arm.at(HOME, "tool")
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, 2.0)
-    line = sv.paths.line(s, position, position + [0.05, -0.15, -0.1])
+    (s,) = arm.q.references(s=MOVE)
+    line = sv.curves.line(s, position, position + [0.05, -0.15, -0.1])
     pose = sv.programs.pose("tool", arm.frame("tool"), line, sv.rotations.turn(0.4 * s, (0, 0, 1), rotation))
     return arm, arm.mechanism(), pose
 
@@ -29,8 +30,8 @@ def leg_and_place():
     """Three joints in a plane, whose foot follows a line: one of self-motion."""
     arm = sv.urdf(robots.two_legs(), lock=dict.fromkeys(("hind_hip", "hind_knee", "hind_ankle"), 0.0))
     position, _ = arm.at(LEG, "front_foot")
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, 2.0)
-    line = sv.paths.line(s, position, position + [0.05, 0.0, 0.04])
+    (s,) = arm.q.references(s=MOVE)
+    line = sv.curves.line(s, position, position + [0.05, 0.0, 0.04])
     place = sv.programs.follow_point("foot", arm.frame("front_foot").position, line)
     return arm, arm.mechanism(), {name: place[name] for name in ("foot_x", "foot_z")}
 
@@ -60,10 +61,11 @@ def test_accelerations_are_nearest_to_the_wish_in_the_metric_of_the_inertia(kind
     jacobian = ca.jacobian(second, q.jet(2))
     rest = ca.substitute(second, q.jet(2), ca.SX.zeros(q.n))
     parts = [ca.densify(ca.SX(e)) for e in (mechanism.mass, jacobian, rest, wanted)]
-    f = ca.Function("f", [q.t, q.jet(0), q.jet(1)], parts)
+    s = ca.vertcat(*(q.family.jet("s", k) for k in range(3)))
+    f = ca.Function("f", [q.t, s, q.jet(0), q.jet(1)], parts)
     for k in range(50, 1000, 150):
         at = [np.array([run[name][k] for name in q.jet_names(level)]) for level in range(3)]
-        M, J, b, a = (np.array(value) for value in f(run.t[k], at[0], at[1]))
+        M, J, b, a = (np.array(value) for value in f(run.t[k], MOVE.jets(run.t[k], 2)[:, 0], at[0], at[1]))
         root = np.linalg.cholesky(M).T  # |root (q'' - a)| least with J q'' = -b
         change = np.linalg.pinv(J @ np.linalg.inv(root)) @ (-b - J @ a)
         nearest = (a + np.linalg.solve(root, change)).ravel()
@@ -104,9 +106,9 @@ def test_actuators_in_another_order_and_scale_give_the_same_motion():
 
 
 def test_slower_programs_keep_the_metric():
-    _, _, pose = arm_and_pose()
-    arm = arm_and_pose()[0]
-    assert sv.Program(pose, weights="inertia").slowed(arm.q, 2.0).metric == "inertia"
+    q = arm_and_pose()[0].q
+    program = sv.Program({"turn": q["joint_1"] - 0.1 * ca.sin(q.t)}, weights="inertia")
+    assert program.slowed(q, 2.0).metric == program.slower(q, 2.0, 0.0).metric == "inertia"
 
 
 def test_what_has_no_such_metric_is_refused():

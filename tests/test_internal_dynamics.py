@@ -200,7 +200,7 @@ def test_a_pole_that_falls_is_unstable_over_any_longer_time():
     bob = ca.vertcat(x + 0.6 * ca.sin(theta), 0.6 * ca.cos(theta))
     S = sv.particle(q, 2.0, x) + sv.particle(q, 0.5, bob)
     cart = sv.Mechanism(q, S, potential=0.5 * 9.81 * bob[1], actuators={"motor": x})
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.5, smoothness=4)
+    path = q.references(cart=sv.paths.rest_to_rest(0.0, 1.0, duration=1.5, smoothness=4)).cart
     model = sv.derive(cart, sv.Program({"cart": x - path}, by="actuators"))
     for length in (0.75, 1.5, 4.0):
         with warned("unstable"):

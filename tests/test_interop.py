@@ -372,7 +372,7 @@ def test_a_plant_is_linearised_along_a_plan_that_has_fewer_coordinates():
     x, phi = q
     gibbs = sv.particle(q, 3.0, (x,)) + sv.particle(q, 2.0, (phi,))
     mechanism = sv.Mechanism(q, gibbs=gibbs, potential=4.0 * phi**2, actuators={"F": x})
-    model = sv.derive(mechanism, sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)}))
+    model = sv.derive(mechanism, sv.Program({"X": x - q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)).X}))
     plan, plant = sv.simulate(model, model.start(), (0.0, 2.0)), sv.plant(mechanism)
     systems = list(interop.along(plant, plan, [0.5, 1.5]))
     for system in systems:

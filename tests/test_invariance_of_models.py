@@ -44,8 +44,9 @@ def crane(names="x l theta", unit=1.0, permutation=(0, 1, 2), residuals=None, qu
         q = q.with_quasi_velocities("u v w", [V[i] for i in permutation])
     load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
     start, end = ((a * unit, b * unit) for a, b in ((0.0, 4.0), (5.0, 2.0)))
-    path = sv.paths.rest_to_rest(q.t, start, end, duration=6.0, smoothness=5)
-    X, Z = load[0] - path[0], load[1] - path[1]
+    path = sv.paths.rest_to_rest(start, end, duration=6.0, smoothness=5)
+    r = q.references(X=path[0], Z=path[1])
+    X, Z = load[0] - r.X, load[1] - r.Z
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load),
@@ -147,9 +148,9 @@ def test_the_3d_crane_in_millimetres_and_in_another_order_is_flat(gallery_model)
     rope = ca.vertcat(ca.sin(theta), ca.cos(theta) * ca.sin(phi), ca.cos(theta) * ca.cos(phi))
     load = ca.vertcat(x, y, 0) + l * rope
     bodies = ((p.m_bridge, x), (p.m_trolley, y), (p.m_hoist, l), (p.m_load, load))
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=6.0, smoothness=6)
-    turn = sv.paths.circle(np.pi / 2 * (s - 1), centre=(0.0, 3000.0), radius=3000.0)
-    path = ca.vertcat(turn, sv.paths.line(s, 5000.0, 3000.0))
+    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=6.0, smoothness=6)).s
+    turn = sv.curves.circle(np.pi / 2 * (s - 1), centre=(0.0, 3000.0), radius=3000.0)
+    path = ca.vertcat(turn, sv.curves.line(s, 5000.0, 3000.0))
     mechanism = sv.Mechanism(
         q,
         gibbs=sum(sv.particle(q, m, position) for m, position in bodies),
@@ -194,8 +195,9 @@ def test_the_planar_cranes_agree():
     """Blajer's winch is a hoist of inertia J/r² and length r·beta."""
     mechanism, _ = overhead_crane()
     (x, l, theta), q, p = mechanism.q, mechanism.q, mechanism.parameters
-    path = sv.paths.rest_to_rest(q.t, (0.0, 4.0), (1.0, 5.0), duration=6.0, smoothness=6)
-    program = {"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]}
+    path = sv.paths.rest_to_rest((0.0, 4.0), (1.0, 5.0), duration=6.0, smoothness=6)
+    r = q.references(across=path[0], below=path[1])
+    program = {"X": x + l * ca.sin(theta) - r.across, "Z": l * ca.cos(theta) - r.below}
     hoist = derive(mechanism, sv.Program(program)).with_parameters(m_hoist=0.1 / 0.1**2)
     winch = derive(*winch_crane())
     u = signal(hoist, "actuation", 2.5, motion(hoist, 2.5, guess={"l": 4.0}))
@@ -211,7 +213,7 @@ def cars_with_friction(friction):
     p = sv.parameters(m=1.0, k=1.0, c=friction)
     q = sv.coordinates("x1 x2")
     (x1, x2), (v1, v2) = q, q.d(1)
-    path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=2.0, smoothness=6)
+    path = q.references(X=sv.paths.rest_to_rest(0.5, 2.5, duration=2.0, smoothness=6)).X
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.particle(q, p.m, x1) + sv.particle(q, p.m, x2),
@@ -290,7 +292,7 @@ def test_a_model_near_a_state_is_the_same_model(name, gallery_model):
     expected = signal(model, kind, t, jets)
     assert signal(near, kind, t, jets) == pytest.approx(expected, rel=1e-8, abs=1e-8)
     x = jets[: len(model.state_names)]
-    rates = [m.function("ode")(t, x, m.parameters)[: len(x)] for m in (model, near)]
+    rates = [m.function("ode")(t, x, m.p)[: len(x)] for m in (model, near)]
     assert rates[0] == pytest.approx(rates[1], rel=1e-7, abs=1e-7)
 
 
@@ -299,7 +301,7 @@ def test_a_start_where_a_pivot_vanishes_gets_pivots_of_its_own(name, gallery_mod
     model, scene = gallery_model(name), gallery[name]
     state = model.start(0.0, guess=scene.guess, **scene.start)
     near = derived_near(model, 0.0, np.append(state.values, np.zeros(model.n)))
-    rates = near.function("ode")(0.0, state.values, model.parameters)[: len(state.values)]
+    rates = near.function("ode")(0.0, state.values, model.p)[: len(state.values)]
     assert np.all(np.isfinite(rates))
     reaction = signal(near, "reaction", 0.0, np.append(state.values, rates[-model.n :]))
     assert np.all(np.isfinite(list(reaction.values())))

@@ -52,12 +52,13 @@ def crane(w):
     x, l, theta = s["x"], s["l"], s["theta"]
     load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
     start, end = (0.0, 4.0 * w.unit), (5.0 * w.unit, 2.0 * w.unit)
-    path = sv.paths.rest_to_rest(q.t, start, end, duration=6.0, smoothness=4)
+    path = sv.paths.rest_to_rest(start, end, duration=6.0, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
     S = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load)
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=-p.m_load * p.g * load[1], actuators={"trolley": x, "hoist": l}, parameters=p
     )
-    model = w.derived(q, mechanism, {"X": load[0] - path[0], "Z": load[1] - path[1]})
+    model = w.derived(q, mechanism, {"X": load[0] - r.X, "Z": load[1] - r.Z})
     return model, {"guess": {w.prefix + "l": 4.0 * w.unit}}, 6.0, {"x": 1, "l": 1, "theta": 0, "trolley": 1, "hoist": 1}
 
 
@@ -95,7 +96,7 @@ def mass_on_car(w):
     x, s = sym["x"], sym["s"]
     mass = ca.vertcat(x + s * np.cos(ALPHA), s * np.sin(ALPHA))
     _, ds = w.rates(q, "x s", 1)
-    path = sv.paths.rest_to_rest(q.t, 0.5 * w.unit, 2.5 * w.unit, duration=3.0, smoothness=6)
+    path = q.references(z=sv.paths.rest_to_rest(0.5 * w.unit, 2.5 * w.unit, duration=3.0, smoothness=6)).z
     column = q.V.T @ ca.gradient(s, ca.vertcat(*q))
     mechanism = sv.Mechanism(
         q,

@@ -115,7 +115,7 @@ def test_a_start_near_a_rest_serves_relaxed_plans_too():
     S = sv.particle(q, 10.0, (x, 0)) + sv.particle(q, 100.0, load)
     V = 981.0 * load[1] + 1e4 * (l - 4.0) ** 2 / 2
     mechanism = sv.Mechanism(q, gibbs=S, potential=V, forces={"l": -200.0 * q.d(1)[1]}, actuators={"F": x})
-    program = sv.Program({"X": load[0] - sv.paths.rest_to_rest(q.t, 0.0, 3.0, 6.0)})
+    program = sv.Program({"X": load[0] - q.references(X=sv.paths.rest_to_rest(0.0, 3.0, 6.0)).X})
     run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
     assert said(run).startswith("relaxed, as the program is singular at rest")
     assert run["l"][[0, -1]] == pytest.approx(4.0 + 981.0 / 1e4, abs=1e-9)
@@ -142,7 +142,8 @@ def test_a_marginal_program_that_comes_to_rest_is_not_warned_about(recwarn):
     """A path of many swings excites none."""
     mechanism, _ = hanging()
     x, _ = mechanism.q
-    program = sv.Program({"X": x - sv.paths.rest_to_rest(mechanism.q.t, 0.0, 1.0, duration=20.02, smoothness=4)})
+    r = mechanism.q.references(slow=sv.paths.rest_to_rest(0.0, 1.0, duration=20.02, smoothness=4))
+    program = sv.Program({"X": x - r.slow})
     run = sv.inverse(mechanism, program, (0.0, 20.02))
     assert said(run).startswith("forward, as the program is marginal") and "goes on" not in run.message
     assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
@@ -153,7 +154,8 @@ def test_a_program_with_unstable_modes_beside_swinging_ones_is_not_integrated_fo
     x, a, b = q
     S = sum(sv.particle(q, 1.0, each) for each in q)
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"F": x}, forces={"a": -4.0 * a + x, "b": 9.0 * b + x})
-    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)})
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=4))
+    program = sv.Program({"X": x - r.X})
     run = sv.inverse(mechanism, program, (-3.0, 5.0))
     assert said(run).startswith("relaxed, as the program is non-minimum phase (at both ends eigenvalues 3, 0 ± 2i, -3")
     assert "swing on" in said(run) and np.abs(run["F"]).max() < 2.5  # the path alone takes 1.9 N
@@ -166,8 +168,9 @@ def test_a_program_with_unstable_modes_beside_swinging_ones_is_not_integrated_fo
 def test_a_rough_path_gets_a_relaxed_plan():
     mechanism, _ = overhead_crane()
     x, l, theta = mechanism.q
-    path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=2)
-    program = sv.Program({"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]})
+    path = sv.paths.rest_to_rest((0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=2)
+    r = mechanism.q.references(across=path[0], below=path[1])
+    program = sv.Program({"X": x + l * ca.sin(theta) - r.across, "Z": l * ca.cos(theta) - r.below})
     run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
     assert run.method == "relaxed" and "C^2" in said(run) and "needs 4" in said(run)
     assert np.abs(run.residual["X"][0]).max() < 1e-2
@@ -206,7 +209,8 @@ def hanging():
     x, a = q
     S = sv.particle(q, 2.0, (x, 0)) + sv.particle(q, 0.5, (x + 0.7 * ca.sin(a), -0.7 * ca.cos(a)))
     mechanism = sv.Mechanism(q, gibbs=S, potential=-0.5 * 9.81 * 0.7 * ca.cos(a), actuators={"F": x})
-    return mechanism, sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)})
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=4))
+    return mechanism, sv.Program({"X": x - r.X})
 
 
 @pytest.mark.parametrize("span, missed", [((-3.0, 5.0), "0.0356")])
@@ -228,7 +232,7 @@ def test_a_plan_between_rests_of_other_stability_says_how_far_it_misses():
 def test_plans_that_meet_their_program_are_not_warned_about(recwarn):
     sv.inverse(*crane(), (0.0, 6.0))
     mechanism, _ = beside(lambda x, y, v: -y - 0.2 * v - x)
-    path = sv.paths.rest_to_rest(mechanism.q.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    path = mechanism.q.references(V=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=4)).V
     run = sv.inverse(mechanism, sv.Program({"V": mechanism.q.d(1)[0] - path}), (0.0, 2.0), method="relaxed")
     assert not [w for w in recwarn if issubclass(w.category, RuntimeWarning)]
     assert "its end is open" in said(run) and run["dx"][-1] == pytest.approx(1.0, abs=1e-4)

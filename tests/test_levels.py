@@ -22,7 +22,7 @@ def lift(rope="rigid", smoothness=6):
     p = sv.parameters(m=100.0, M=20.0, k=2e5, g=9.81)
     q = sv.coordinates("h y" if rope == "elastic" else "h")
     h, y = tuple(q)[0], tuple(q)[-1]
-    path = sv.paths.rest_to_rest(q.t, 0.0, 2.0, duration=3.0, smoothness=smoothness)
+    path = q.references(load=sv.paths.rest_to_rest(0.0, 2.0, duration=3.0, smoothness=smoothness)).load
     mechanism = sv.Mechanism(
         q,
         sv.particle(q, p.M, h) + sv.particle(q, p.m, y),
@@ -47,7 +47,7 @@ def joint(kind="rigid"):
         outputs={"angle": link},
         parameters=p,
     )
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.5, duration=1.0, smoothness=6)
+    path = q.references(angle=sv.paths.rest_to_rest(0.0, 1.5, duration=1.0, smoothness=6)).angle
     return mechanism, sv.Program({"angle": link - path}, by="actuators")
 
 
@@ -66,7 +66,7 @@ def cart(friction=False, linear=False):
         actuators={"force": x},
         parameters=p,
     )
-    path = p.distance * sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    path = p.distance * q.references(x=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=4)).x
     return mechanism, sv.Program({"x": x - path}, by="actuators")
 
 
@@ -85,8 +85,9 @@ def arm(payload="point"):
         actuators={"shoulder": a, "elbow": b},
         parameters=p,
     )
-    path = sv.paths.rest_to_rest(q.t, (0.3, 0.5), (1.2, 1.4), duration=1.0, smoothness=4)
-    return mechanism, sv.Program({"a": a - path[0], "b": b - path[1]}, by="actuators")
+    path = sv.paths.rest_to_rest((0.3, 0.5), (1.2, 1.4), duration=1.0, smoothness=4)
+    r = q.references(a=path[0], b=path[1])
+    return mechanism, sv.Program({"a": a - r.a, "b": b - r.b}, by="actuators")
 
 
 def crane(rope="rigid"):
@@ -104,8 +105,9 @@ def crane(rope="rigid"):
         outputs={"X": load[0], "Z": load[1]},
         parameters=p,
     )
-    path = sv.paths.rest_to_rest(q.t, (0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=6)
-    return mechanism, sv.Program({"X": load[0] - path[0], "Z": load[1] - path[1]}, by="actuators")
+    path = sv.paths.rest_to_rest((0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=6)
+    r = q.references(X=path[0], Z=path[1])
+    return mechanism, sv.Program({"X": load[0] - r.X, "Z": load[1] - r.Z}, by="actuators")
 
 
 @cache
@@ -142,11 +144,8 @@ def instants(t1, count=2001):
 
 
 def derivative(order, t):
-    q = sv.coordinates("x")
-    path = sv.paths.rest_to_rest(q.t, 0.0, 2.0, duration=3.0, smoothness=6)
-    for _ in range(order):
-        path = ca.jacobian(path, q.t)
-    return ca.Function("path", [q.t], [path])(t[None, :]).full()[0]
+    path = sv.paths.rest_to_rest(0.0, 2.0, duration=3.0, smoothness=6)
+    return path.jets(t, order)[order, 0]
 
 
 # --- errors
@@ -203,7 +202,7 @@ def test_a_stiff_model_is_measured_by_an_implicit_method_too():
             q, sv.particle(q, 2.0, x) + sv.particle(q, 1.0, y), actuators={"u": x},
             forces={"x": pull if stiff else y - x, "y": -pull if stiff else x - y},
         )  # fmt: skip
-        path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
+        path = q.references(x=sv.paths.rest_to_rest(0.0, 1.0, 1.0, smoothness=4)).x
         return sv.derive(mechanism, sv.Program({"x": x - path}, by="actuators"))
 
     models = {"stiff": coupled(), "soft": coupled(False)}
@@ -236,9 +235,9 @@ def test_models_start_alike():
 def test_coordinates_that_play_no_part_are_compared_on_demand():
     q = sv.coordinates("x y")
     x, y = q
-    S, path = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y), sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
-    mechanism = sv.Mechanism(q, S, potential=2 * y**2, actuators={"u": x})
-    model = sv.derive(mechanism, sv.Program({"x": x - path}, by="actuators"))
+    mechanism = sv.Mechanism(q, sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y), potential=2 * y**2, actuators={"u": x})
+    r = q.references(x=sv.paths.rest_to_rest(0.0, 1.0, 1.0, smoothness=4))
+    model = sv.derive(mechanism, sv.Program({"x": x - r.x}, by="actuators"))
     assert "y" not in sv.tradeoff(model, model.start(), (0.0, 1.0)).meta["outputs"]
     whole = including(model, ["y"])
     study = sv.tradeoff(whole, whole.start(y=0.1), (0.0, 1.0), {"Taylor": 1e-9}, "project", outputs=["x", "y"])

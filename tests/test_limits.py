@@ -149,7 +149,7 @@ def test_slacks_do_not_depend_on_the_units_of_inputs(unit):
     x, y = q
     mass = sv.particle(q, 2.0, ca.vertcat(x, y))
     mechanism = sv.Mechanism(q, gibbs=mass, actuators={"a": unit * x, "b": unit * y})
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)).X
     model = sv.derive(mechanism, sv.Program({"X": x - path, "Y": y}))
     plan = sv.simulate(model, model.start(), (0.0, 2.0))
     plant = sv.plant(mechanism, rate_limits={"a": 1e3 / unit})

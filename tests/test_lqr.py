@@ -78,8 +78,9 @@ def test_the_integral_of_an_output_is_that_of_the_residual_about_the_same_path()
         q, gibbs=sv.particle(q, p.m, x) + sv.particle(q, 1.0, phi), actuators={"force": x, "torque": phi},
         parameters=p, outputs={"load": load, "speed": q.dt(load), "pull": q.d(2)[0]},
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.0), end=(1.0, 0.8), duration=2.0, smoothness=4)
-    model = sv.derive(mechanism, sv.Program({"place": load - path[0], "turn": phi - path[1]}, by="actuators"))
+    path = sv.paths.rest_to_rest(start=(0.0, 0.0), end=(1.0, 0.8), duration=2.0, smoothness=4)
+    r = q.references(place=path[0], turn=path[1])
+    model = sv.derive(mechanism, sv.Program({"place": load - r.place, "turn": phi - r.turn}, by="actuators"))
     plan, plant = sv.simulate(model, model.start(0.0), (0.0, 2.0)), sv.plant(mechanism, arm=0.6)
     laws = [sv.lqr(plan, plant, integral={name: 1e4}) for name in ("place", "load")]
     assert np.array_equal(*(law.info["gains"] for law in laws))
@@ -254,7 +255,7 @@ def two_masses(stiffness):
         actuators={"force": x},
         parameters=p,
     )
-    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=3)})
+    program = sv.Program({"X": x - q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=3)).X})
     model = sv.derive(mechanism, program, keep=["y"])
     return sv.simulate(model, model.start(y=0.0, dy=0.0), (0.0, 1.0)), sv.plant(mechanism)
 

@@ -105,7 +105,7 @@ def test_starts_by_name_follow_for_all_cases_at_once(gallery_model, monkeypatch,
 
 def test_starts_with_several_solutions_are_those_of_start(monkeypatch):
     """The angle of a rod whose height is given has two: each case takes the one that `Model.start` names."""
-    model = held_pendulum(lambda t, p: ca.sin(p.f * t))
+    model = held_pendulum(lambda q, p: ca.sin(p.f * q.t))
     many = sv.simulate_many(model, {}, {"r": [1.0, 1.5]}, (0.0, 0.2), t_eval=[0.0])
     for i, r in enumerate((1.0, 1.5)):
         assert many.trace["a"][0, i] == pytest.approx(model.with_parameters(r=r).start()["a"], abs=1e-12)
@@ -125,7 +125,7 @@ def test_what_the_calling_thread_leaves_others_compute(quick, n, monkeypatch, c_
     """Short work starts no thread; of long work the cases that were begun are computed again, to the same bits."""
     started, angles = [], np.random.default_rng(SEED).uniform(-3, 3, n)
     problems = [(pendulum(), {"a": angles, "da": 0.0}, None, (0.0, 1.0)),
-                (held_pendulum(lambda t, p: ca.sin(p.f * t)), {"a": 0.9}, {"f": angles}, (0.0, 1.0))]  # fmt: skip
+                (held_pendulum(lambda q, p: ca.sin(p.f * q.t)), {"a": 0.9}, {"f": angles}, (0.0, 1.0))]  # fmt: skip
     problems[1] = (problems[1][0], problems[1][0].start(guess={"a": 0.9}), *problems[1][2:])
     expected = [sv.simulate_many(*problem, t_eval=[0.3, 0.9]) for problem in problems]
     most = lanes.IN_CALLER
@@ -240,13 +240,13 @@ def held_pendulum(path, quasi=False, height=lambda t: 0.5 + 0.1 * ca.cos(t)):
     potential = -p.m * p.g * p.r * ca.cos(a)
     mechanism = sv.Mechanism(q, gibbs=S, potential=potential, actuators={"F": x, "M": a}, parameters=p)
     height = p.r * ca.cos(a) - height(q.t)
-    return sv.derive(mechanism, sv.Program({"place": x + p.r * ca.sin(a) - path(q.t, p), "height": height}))
+    return sv.derive(mechanism, sv.Program({"place": x + p.r * ca.sin(a) - path(q, p), "height": height}))
 
 
 @pytest.mark.parametrize("quasi", [False, True])
 def test_plans_whose_motion_depends_on_parameters(quasi, monkeypatch, c_compiler):
     """r cos a = 0.5 + 0.1 cos t, x = sin(f t) - r sin a."""
-    model = held_pendulum(lambda t, p: ca.sin(p.f * t), quasi)
+    model = held_pendulum(lambda q, p: ca.sin(p.f * q.t), quasi)
     start = model.start(guess={"a": 0.9})
     r, f = np.linspace(0.7, 2.0, 9), np.linspace(0.5, 3.0, 9)
     with monkeypatch.context() as patch:
@@ -267,7 +267,7 @@ def test_plans_whose_motion_depends_on_parameters(quasi, monkeypatch, c_compiler
 @pytest.mark.parametrize("quasi", [False, True])
 def test_what_stays_constant_keeps_the_derivation(height, quasi):
     """Velocities that a program keeps at zero are rounding at all points, and no reason to derive again."""
-    model = held_pendulum(lambda t, p: ca.sin(p.f * t), quasi, height)
+    model = held_pendulum(lambda q, p: ca.sin(p.f * q.t), quasi, height)
     values = model.parameters.copy()
     values[[*model.numbers].index("r")] = 1.3
     assert affirmed(model, values) and holds(model.reduction, values)
@@ -278,7 +278,7 @@ def test_what_stays_constant_keeps_the_derivation(height, quasi):
 
 def test_plans_with_other_knots_and_without_solutions():
     """Paths of other durations leave the compiled plans, and where the rod is too short there is no plan."""
-    model = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    model = held_pendulum(lambda q, p: q.references(place=sv.paths.rest_to_rest(0.0, 1.0, duration=p.T)).place)
     start = model.start(guess={"a": 0.9})
     many = sv.simulate_many(model, start, {"T": [2.0, 1.0, 2.0], "r": [1.0, 1.0, 0.5]}, (0.0, 1.5), t_eval=[0.8])
     assert list(many["error"] != "") == [False, False, True]
@@ -432,7 +432,7 @@ def test_motions_have_the_signals_of_a_run(name, span, count, gallery_model):
 
 def test_signals_of_motions_by_themselves_and_of_errors():
     """Plans with other knots have models of their own; where there is no motion there is no force."""
-    model = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    model = held_pendulum(lambda q, p: q.references(place=sv.paths.rest_to_rest(0.0, 1.0, duration=p.T)).place)
     start = model.start(guess={"a": 0.9})
     cases = {"T": [2.0, 1.0, 2.0, 2.0], "r": [1.0, 1.0, 0.5, 1.1], "m": [1.0, 2.0, 3.0, 4.0]}
     many = sv.simulate_many(model, start, cases, (0.0, 1.5), t_eval=[0.8])
@@ -488,7 +488,7 @@ SPAWNED = partial(ProcessPoolExecutor, mp_context=get_context("spawn"), initiali
 @pytest.mark.parametrize("pool", [ThreadPoolExecutor, SPAWNED])
 def test_an_executor_computes_the_same_bits(pool, gallery_model, c_compiler):
     """Lanes, plans of one model and of several, starts of all forms, and cases that fail."""
-    rod = held_pendulum(lambda t, p: sv.paths.rest_to_rest(t, 0.0, 1.0, duration=p.T))
+    rod = held_pendulum(lambda q, p: q.references(place=sv.paths.rest_to_rest(0.0, 1.0, duration=p.T)).place)
     angles = np.linspace(-2.0, 2.0, 4)
     states = np.array([angles * 0, angles, angles * 0, angles])
     free, wheel = pendulum(), gallery_model("appell-hamel")

@@ -133,8 +133,8 @@ def test_every_difference_makes_another_key(derived):
         store.fingerprint(*pendulum(path=ca.cos)),
         store.fingerprint(*pendulum(path=lambda t: ca.sin(t + 0))),
         store.fingerprint(*pendulum(path=lambda t: ca.sin(2 * t))),
-        store.fingerprint(*pendulum(path=lambda t: ca.if_else(t < 1, t, 1))),
-        store.fingerprint(*pendulum(path=lambda t: ca.if_else(t <= 1, t, 1))),
+        store.fingerprint(*pendulum(output=lambda q: {"height": ca.if_else(q[0] < 1, q[0], 1)})),
+        store.fingerprint(*pendulum(output=lambda q: {"height": ca.if_else(q[0] <= 1, q[0], 1)})),
         store.fingerprint(*pendulum(by="ideal")),
         store.fingerprint(*pendulum(torque="motor")),
         store.fingerprint(*pendulum(gravity=9.80665)),
@@ -295,16 +295,16 @@ def test_what_was_read_takes_other_numbers_as_what_was_derived(derived):
     changed = [model.with_parameters(m_load=50.0) for model in (early, late)]
     assert len(derived) == 1
     jets = np.array([0.0, 4.0, 0.1, *np.full(6, 0.1)])
-    values = [model.signals("actuation")[1](0.3, jets, model.parameters) for model in changed]
+    values = [model.signals("actuation")[1](0.3, jets, model.p) for model in changed]
     assert np.array_equal(*values) and not np.array_equal(
-        values[0], early.signals("actuation")[1](0.3, jets, early.parameters)
+        values[0], early.signals("actuation")[1](0.3, jets, early.p)
     )
 
 
 def test_other_pivots_are_kept_too(derived):
     early, late = (sv.derive(*gallery["overhead-crane"].build()) for _ in range(2))
     jets = np.array([0.0, 4.0, 0.1, *np.full(6, 0.1)])
-    found = [derived_near(model, 0.3, jets).function("path")(0.3, jets[:3], model.parameters) for model in (early, late)]
+    found = [derived_near(model, 0.3, jets).function("path")(0.3, jets[:3], model.p) for model in (early, late)]
     assert len(derived) == 2 and np.array_equal(*found)
 
 
@@ -326,7 +326,7 @@ def test_what_a_changed_specification_gives_is_not_kept(derived):
         changed.signals("outputs")
     with refused(sv.errors.SpecificationError, "mechanism", "program"):
         derived_near(changed, 0.0, [0.0, 1.0, 0.0])
-    assert model.signals("outputs")[1](0.0, [0.3, 0.0, 0.0], model.parameters) == np.cos(0.3)
+    assert model.signals("outputs")[1](0.0, [0.3, 0.0, 0.0], model.p) == np.cos(0.3)
 
 
 def test_what_another_user_wrote_is_not_read(derived, tmp_path, monkeypatch):

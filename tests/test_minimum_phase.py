@@ -26,7 +26,8 @@ def aircraft():
     x, z, theta = q
     across, along = (ca.vertcat(ca.cos(theta), ca.sin(theta)), ca.vertcat(-ca.sin(theta), ca.cos(theta)))
     lever = p.l * ca.cos(p.tilt) + p.h * ca.sin(p.tilt)
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.0), end=(5.0, 2.0), duration=4.0, smoothness=4)
+    path = sv.paths.rest_to_rest(start=(0.0, 0.0), end=(5.0, 2.0), duration=4.0, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
     point = ca.vertcat(x, z) + p.height * along
     mechanism = sv.Mechanism(
         q, gibbs=sv.rigid_body(q, p.M, (0, 0, p.J), position=(x, z), rates=(0, 0, q.d(1)[2])),
@@ -34,7 +35,7 @@ def aircraft():
         actuators={"u1": ca.vertcat(along + ca.sin(p.tilt) * across, lever),
                    "u2": ca.vertcat(along - ca.sin(p.tilt) * across, -lever)},
     )  # fmt: skip
-    return sv.derive(mechanism, sv.Program({"X": point[0] - path[0], "Z": point[1] - path[1]}))
+    return sv.derive(mechanism, sv.Program({"X": point[0] - r.X, "Z": point[1] - r.Z}))
 
 
 def oscillator(coupling=None, **numbers):
@@ -46,7 +47,7 @@ def oscillator(coupling=None, **numbers):
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=p.k * (y - x) ** 2 / 2, forces=(0, -p.d * dy), actuators={"a": x}, parameters=p
     )
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=4)).X
     return mechanism, sv.Program({"X": x + (coupling(p) if coupling else p.w) * y - path})
 
 
@@ -178,7 +179,7 @@ def test_a_highest_coefficient_that_touches_zero_is_found(ends):
     plate = ca.vertcat(x + s * c, s * ca.sin(p.w - 0.3))
     S = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, plate)
     mechanism = sv.Mechanism(q, gibbs=S, potential=5 * s**2 / 2, forces=(0, -ds), actuators={"F": x}, parameters=p)
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, 1.0, smoothness=4)).X
     result = sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x + s * c - path})), "w", ends)
     (critical,) = result.critical
     assert critical.value == pytest.approx(0.3, abs=1e-7)  # a double root, known to the square root of rounding
@@ -195,7 +196,7 @@ def test_several_ranges():
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=ca.sin(p.w) * y**2 / 2, forces=(0, -0.5 * dy), actuators={"a": x}, parameters=p
     )
-    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)})
+    program = sv.Program({"X": x - q.references(X=sv.paths.rest_to_rest(0.0, 1.0, 1.0, smoothness=4)).X})
     with refused(sv.errors.SpecificationError, "keep=['y']", parameter="w", left_out=("y",)):
         sv.minimum_phase(sv.derive(mechanism, program), "w", (1.0, 11.0))
     result = sv.minimum_phase(sv.derive(mechanism, program, keep=["y"]), "w", (1.0, 11.0))
@@ -224,7 +225,7 @@ def chain(n, parameter):
     U = sum((3.0 + i) * (x[i] - x[i + 1]) ** 2 / 2 for i in range(n - 1)) + 0.5 * x[-1] ** 2 / 2
     drag = ca.vertcat(*(-0.4 * rate for rate in v))
     mechanism = sv.Mechanism(q, gibbs=S, potential=U, forces=drag, actuators={"force": x[0]}, parameters=p)
-    path = sv.paths.rest_to_rest(q.t, 0.0, 0.0 + 1.0, duration=1.0, smoothness=14)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 0.0 + 1.0, duration=1.0, smoothness=14)).X
     return sv.derive(mechanism, sv.Program({"X": (1 - p.w) * x[0] + p.w * x[-1] - path}))
 
 
@@ -253,7 +254,7 @@ def test_absolute_coordinates_and_quasi_velocities_give_the_same_boundary():
         S += sv.rigid_body(q, 1.0, (0, 0, 1 / 12), position=first + second / 2, rates=(0, 0, rates[1]))
         bend, slide = two - one, rates[1] - rates[0]
         torque = -p.d * slide * ca.vertcat(-1, 1, *([0] * (q.n - 2)))
-        path = sv.paths.rest_to_rest(q.t, 0.0, np.pi / 2, duration=2.0, smoothness=4)
+        path = q.references(angle=sv.paths.rest_to_rest(0.0, np.pi / 2, duration=2.0, smoothness=4)).angle
         mechanism = sv.Mechanism(
             q, gibbs=S, potential=p.c * bend**2 / 2, forces=q.V.T @ torque if not q.plain else torque,
             actuators={"torque": one}, constraints=constraints, parameters=p,
@@ -273,7 +274,7 @@ def test_absolute_coordinates_and_quasi_velocities_give_the_same_boundary():
     S = sv.rigid_body(bound, 1.0, (0, 0, 1 / 12), position=first / 2, rates=(0, 0, rates[0]))
     S += sv.rigid_body(bound, 1.0, (0, 0, 1 / 12), position=first + second / 2, rates=(0, 0, rates[1]))
     torque = -p.d * rates[2] * ca.vertcat(0, 0, 1)
-    path = sv.paths.rest_to_rest(bound.t, 0.0, np.pi / 2, duration=2.0, smoothness=4)
+    path = bound.references(angle=sv.paths.rest_to_rest(0.0, np.pi / 2, duration=2.0, smoothness=4)).angle
     mechanism = sv.Mechanism(
         bound, gibbs=S, potential=p.c * z**2 / 2, forces=torque, actuators={"torque": one},
         constraints={"bend": two - one - z}, parameters=p,
@@ -295,7 +296,7 @@ def test_units_do_not_matter(length):
     S = sv.particle(q, 3.0, x) + sv.particle(q, 2.0, bob)
     mechanism = sv.Mechanism(q, gibbs=S, potential=2 * 9.81 * length * bob[1], forces=(0, -0.1 * length**2 * dtheta),
                              actuators={"force": x}, parameters=p)  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, 0.0, length, duration=4.0, smoothness=4)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, length, duration=4.0, smoothness=4)).X
     model = sv.derive(mechanism, sv.Program({"X": x + p.a * ca.sin(theta) - path}))
     result = sv.minimum_phase(model, "a", (0.0, 1.7 * length))
     # a point at the distance a below the car: L - a multiplies θ'', so the bob itself loses the relative degree
@@ -383,7 +384,7 @@ def test_a_coefficient_counts_above_1e_11(mass, states):
     (x, y), (_, dy) = q, q.d(1)
     S = sv.particle(q, 1.0, x) + sv.particle(q, mass, y)
     mechanism = sv.Mechanism(q, gibbs=S, potential=y**2 / 2, forces=(0, -dy), actuators={"a": x}, parameters=p)
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, 1.0, smoothness=4)).X
     model = sv.derive(mechanism, sv.Program({"X": x + p.w * ca.sin(y) ** 2 - path}))
     assert sv.minimum_phase(model, "w", (0.05, 0.15)).eigenvalues(0.1).size == states
 
@@ -393,7 +394,7 @@ def test_a_relative_degree_that_is_lost_at_the_rest_itself_is_found():
     (x, y), (dx, dy) = q, q.d(1)
     masses, springs = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y), 2.0 * (x - y) ** 2 + 3.0 * x**2
     mechanism = sv.Mechanism(q, masses, potential=springs, forces=(-0.1 * dx, -0.1 * dy), actuators={"a": y}, parameters=p)
-    path = sv.paths.rest_to_rest(q.t, 0.0, 0.1, duration=1.0, smoothness=4)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 0.1, duration=1.0, smoothness=4)).X
     found = sv.minimum_phase(sv.derive(mechanism, sv.Program({"X": x + p.w * y + y**2 - path})), "w", (-1.0, 1.0))
     assert [lost["y"] for lost in found.lost(0.5)] == pytest.approx([-0.25])  # where ∂X/∂y = w + 2y vanishes
     assert all(abs(lost["y"]) < 1e-15 for lost in found.lost(0.0)) and found.lost(0.0)

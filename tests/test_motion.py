@@ -57,7 +57,7 @@ def test_fixed_steps_end_at_the_end_of_the_span_and_at_knots(end):
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, (x, y)))
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, t_start=0.7, duration=2.1)
+    path = q.references(p=sv.paths.rest_to_rest(0.0, 1.0, t_start=0.7, duration=2.1)).p
     model = sv.derive(mechanism, sv.Program({"p": q.dt(y + x / 2 - path)}, by="ideal"))
     run = sv.simulate(model, model.start(x=0.0, y=0.0, dx=0.0), (0.0, end), sv.methods.RungeKutta(4, step=0.01))
     assert run.t[-1] == end and np.all(np.diff(run.t) > 0.009)

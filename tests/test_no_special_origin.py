@@ -12,7 +12,8 @@ FLAT, INTEGRATED = 1e-9, 1e-7  # of a signal's size: instant by instant; ten tim
 
 
 def rest_to_rest(q, start, end, duration=6.0):
-    return sv.paths.rest_to_rest(q.t, start, end, duration=duration, smoothness=4)
+    path = sv.paths.rest_to_rest(start, end, duration=duration, smoothness=4)
+    return [*q.references(**{f"r{i}": path[i] for i in range(path.dim)})]
 
 
 def crab_crane(at=0.0, zero=0.0, unit=1.0, inertia=200.0, damping=50.0):
@@ -24,7 +25,7 @@ def crab_crane(at=0.0, zero=0.0, unit=1.0, inertia=200.0, damping=50.0):
     S = sv.particle(q, 2.5, x) + sv.rigid_body(q, 60.0, (0, 0, inertia), position=load, rates=rates)
     return sv.Mechanism(
         q, S, potential=60 * g * load[1], forces={"th": -damping * q.d(1)[1]}, actuators={"f": ca.vertcat(1 / unit, 0)}
-    ), sv.Program({"load": load[0] - rest_to_rest(q, at, at + 3.0)})
+    ), sv.Program({"load": load[0] - rest_to_rest(q, at, at + 3.0)[0]})
 
 
 def damped_crane(at=0.0, rail=0.0):
@@ -57,7 +58,7 @@ def tool_below(at=0.0, zero=0.0):
     load, tool = (ca.vertcat(x + length * ca.sin(angle), -length * ca.cos(angle)) for length in (4.0, 5.0))
     S = sv.particle(q, 5.0, x) + sv.particle(q, 20.0, load)
     mechanism = sv.Mechanism(q, S, potential=20 * 9.81 * load[1], actuators={"f": x})
-    return mechanism, sv.Program({"tool": tool[0] - rest_to_rest(q, at, at + 2.0)})
+    return mechanism, sv.Program({"tool": tool[0] - rest_to_rest(q, at, at + 2.0)[0]})
 
 
 def passive_arm(at=0.0):
@@ -69,7 +70,7 @@ def passive_arm(at=0.0):
     mechanism = sv.Mechanism(
         q, S, potential=2.0 * elbow**2, forces={"elbow": -0.3 * q.d(1)[1]}, actuators={"tau": base}
     )
-    return mechanism, sv.Program({"y": base + 0.2 * elbow - rest_to_rest(q, at, at + 1.0, 3.0)})
+    return mechanism, sv.Program({"y": base + 0.2 * elbow - rest_to_rest(q, at, at + 1.0, 3.0)[0]})
 
 
 def forces(plan):

@@ -106,19 +106,19 @@ BOUNDS = [("dx", 0.5), ("x_output", 0.8)]
 def test_bounds_hold_for_the_signal_of_the_same_name(name, most):
     mechanism, residuals = machine()
     q, plant = mechanism.q, sv.plant(mechanism)
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0, smoothness=4) * (1 - sv.paths.rest_to_rest(q.t - 1.0, 0.0, 1.0, 1.0))
+    path = sv.paths.rest_to_rest(0.0, 1.0, 1.0, smoothness=4).then(sv.paths.rest_to_rest(1.0, 0.0, 1.0))
+    (s,) = q.references(s=path)
     program = sv.Program({"m1": q[0] - s, "x": q[1] - s / 2})
     run = sv.relaxed(plant, program, SPAN, weight=1e-7, bounds={name: (None, most)})
     free = sv.relaxed(plant, program, SPAN, weight=1e-7)
     assert np.max(free[name]) > 1.05 * most and np.max(run[name]) == pytest.approx(most, rel=1e-2)
-    path = np.array(ca.Function("s", [q.t], [s])(run.t[None]))[0]
-    assert np.abs(run["x_residual"] - (run["m1"] - path / 2)).max() < 1e-12
+    assert np.abs(run["x_residual"] - (run["m1"] - path(run.t) / 2)).max() < 1e-12
 
 
 def test_residuals_have_bounds_by_their_longer_name():
     mechanism, _ = machine()
     q, plant = mechanism.q, sv.plant(mechanism)
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0, smoothness=4)
+    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 2.0, smoothness=4)).s
     program = sv.Program({"m1": q[0] - s, "x": q[1] - s / 2})
     limited = sv.relaxed(plant, program, SPAN, weight=1e-7, limits={"x": 3.0, "m1": 20.0})  # can mean actuators alone
     assert np.abs(limited["x_input"]).max() == pytest.approx(3.0, rel=1e-6)

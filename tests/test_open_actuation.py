@@ -35,8 +35,9 @@ def arm(weights=None, toward=None, friction=0.0, gravity=9.81, frame=None, end=(
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=U, forces=q.V.T @ drag, actuators=dict(zip(JOINTS, q, strict=True)),
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, (1.5, 1.0), end, duration=2.0, smoothness=2)
-    residuals = {"X": tip[0] - path[0], "Y": tip[1] - path[1]}
+    path = sv.paths.rest_to_rest((1.5, 1.0), end, duration=2.0, smoothness=2)
+    r = q.references(X=path[0], Y=path[1])
+    residuals = {"X": tip[0] - r.X, "Y": tip[1] - r.Y}
     wishes = toward(q) if toward else None
     return mechanism, sv.Program({key: residuals[key] for key in keys}, weights=weights, toward=wishes)
 

@@ -33,7 +33,7 @@ def consistent_states():
 def derived(model, states):
     """γ'' of the derived rows, (5, N)."""
     f = model.function("ode")
-    return np.array([f(0.0, state, model.parameters)[5:10] for state in states.T]).T
+    return np.array([f(0.0, state, model.p)[5:10] for state in states.T]).T
 
 
 def paper_system(state, residuals):
@@ -72,7 +72,7 @@ def run(gallery_model):
 
 def test_random_states_satisfy_the_program(model):
     states = consistent_states()
-    residuals = [model.function("invariants")(0.0, state, model.parameters) for state in states.T]
+    residuals = [model.function("invariants")(0.0, state, model.p) for state in states.T]
     assert np.max(np.abs(residuals[0][: len(invariant_names(model))])) < 1e-13
     assert cf.paper_4_4(states[4], *states[[5, 6, 8, 9]]) == pytest.approx(np.zeros((2, N)), abs=1e-13)
 
@@ -111,7 +111,7 @@ def test_equations_hold_away_from_the_default_parameters(gallery_model):
     theta, dphi, dtheta = 0.7, -1.3, 2.1
     rates = cf.appell_hamel_rates(np.array([0, 0, 0, 0, theta, dphi, dtheta]), other)
     state = np.concatenate([[0.0, 0.0, 0.0, 0.0, theta], rates[:5]])
-    assert model.function("ode")(0.0, state, model.parameters)[8:10] == pytest.approx(rates[5:], rel=1e-13)
+    assert model.function("ode")(0.0, state, model.p)[8:10] == pytest.approx(rates[5:], rel=1e-13)
 
 
 # errata --------------------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ def along(curve, law, g=0.0, **values):
 
 
 def circle(s):
-    return sv.paths.circle(s, (0.0, 0.0), 2.0)
+    return sv.curves.circle(s, (0.0, 0.0), 2.0)
 
 
 def ellipse(s):
@@ -36,7 +36,22 @@ def ellipse(s):
 
 def wave(s):
     """A spline, whose knots are crossed where the motion reaches them."""
-    return sv.paths.spline(s, [0, 1, 2, 3, 4], [[0, 0], [1, 1], [2, 0], [3, 0.5], [4, 0]], smoothness=4, ends="natural")
+    points = [[0, 0], [1, 1], [2, 0], [3, 0.5], [4, 0]]
+    spline = sv.paths.spline([0, 1, 2, 3, 4], points, smoothness=4, ends="natural")
+    pieces = zip(spline.breaks[:-1], spline.breaks[1:], spline.coefficients, strict=True)
+    pieces = [(high, horner((2 * s - low - high) / (high - low), c)) for low, high, c in pieces]
+    place = pieces[-1][1]
+    for high, piece in reversed(pieces[:-1]):
+        place = ca.if_else(s < high, piece, place)
+    return place
+
+
+def horner(tau, coefficients):
+    """The polynomials with coefficients (dim, size) at tau."""
+    value = ca.SX.zeros(len(coefficients))
+    for c in coefficients.T[::-1]:
+        value = value * tau + ca.DM(c)
+    return value
 
 
 def speed(v):

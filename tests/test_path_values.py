@@ -372,17 +372,18 @@ def test_at_another_rate_the_same_values_come_sooner():
 
 @pytest.mark.parametrize("ends", ["rest", "natural"])
 @pytest.mark.parametrize("k", [0, 1, 2, 4, 6])
-def test_a_spline_is_that_of_the_old_spelling(k, ends):
-    t = ca.SX.sym("t")
-    rows = [sv.paths.spline(t, TIMES, POINTS, k, ends)]
-    for _ in range(k):
-        rows.append(ca.jacobian(rows[-1], t))
-    old = ca.Function("old", [t], [ca.horzcat(*rows)])
-    at = np.setdiff1d(np.linspace(0.1, 11.6, 70), TIMES)
-    expected = np.stack([np.array(old(x)).T for x in at], axis=-1)
+def test_a_spline_is_the_one_through_its_points_with_the_derivatives_that_vanish_at_its_ends(k, ends):
+    """Pieces of degree 2m + 1 and class 2m through n points: m derivatives that vanish at each end leave one."""
     path = spline(TIMES, POINTS, smoothness=k, ends=ends)
-    assert off(path.jets(at, k), expected).max() < 1e-11
     m = k if ends == "rest" else (k + 1) // 2
+    assert path.coefficients.shape[-1] == 2 * m + 2
+    sizes = np.abs(path.jets(np.linspace(0.5, 11.2, 400), 2 * m)).max(axis=(1, 2))
+    assert np.abs(path(TIMES) - POINTS.T).max() < 1e-12
+    after, before = path.jets(TIMES[1:-1], 2 * m), path.jets(np.nextafter(TIMES[1:-1], 0.0), 2 * m)
+    assert (np.abs(after - before).max(axis=(1, 2)) < 1e-11 * sizes).all()
+    vanishing = slice(1, m + 1) if ends == "rest" else slice(m + 1, 2 * m + 1)
+    at_ends = path.jets(np.array([TIMES[0], TIMES[-1]]), 2 * m)[vanishing]
+    assert (np.abs(at_ends).max(axis=(1, 2)) < 1e-11 * sizes[vanishing]).all()
     assert set(path.classes[np.isin(path.breaks, TIMES[1:-1])]) == {2 * m}
     assert path.classes[[0, -1]].tolist() == [k, k] if ends == "rest" else np.isinf(path.classes[[0, -1]]).all()
 
@@ -426,22 +427,6 @@ def test_an_s_curve_of_a_vector_runs_along_the_line():
     jets = path.jets(t, 3)
     assert np.allclose(jets[:, 0] * 4 + (jets[:, 1] - 4.0 * (np.arange(4) == 0)[:, None]) * 3, 0.0, rtol=0, atol=1e-12)
     assert np.linalg.norm(jets[1], axis=0).max() == pytest.approx(1.0, abs=1e-12)
-
-
-def test_the_old_spelling_makes_expressions_and_the_new_one_values():
-    t = ca.SX.sym("t")
-    for made in (
-        sv.paths.rest_to_rest(t, 0.0, 1.0, 2.0), sv.paths.rest_to_rest(t=t, start=0.0, end=1.0, duration=2.0),
-        sv.paths.rest_to_rest(0.5, 0.0, 3.0, duration=1), sv.paths.rest_to_rest(0.5, 0.0, 3.0, 1.0, 4, 0.0),
-        sv.paths.trapezoid(t, 1.0, 2.0, 0.5), sv.paths.trapezoid(0.3, 1.0, 2.0, ramp=0.5),
-        sv.paths.spline(t, [0.0, 1.0], [0.0, 1.0]), sv.paths.spline(0.3, [0.0, 1.0], [0.0, 1.0]),
-    ):  # fmt: skip
-        assert isinstance(made, ca.SX)
-    for made in (
-        sv.paths.rest_to_rest(0.0, 1.0, 2.0), sv.paths.rest_to_rest(start=0.0, end=1.0, duration=2.0, smoothness=6),
-        sv.paths.trapezoid(1.0, 2.0, 0.5, t_start=1.0), sv.paths.spline([0.0, 1.0], [0.0, 1.0], ends="natural"),
-    ):  # fmt: skip
-        assert isinstance(made, Path)
 
 
 # fits ----------------------------------------------------------------------------------------------------------------
@@ -637,3 +622,10 @@ def test_bad_input_is_refused_with_the_facts(make, facts, details):
 def test_an_unknown_spline_end_shows_the_nearest():
     with refused(NameUnknown, name="naturl", match="natural"):
         spline([0.0, 1.0], [0.0, 1.0], ends="naturl")
+
+
+def test_where_a_path_rests_its_derivatives_are_zero_to_the_last_bit():
+    there = rest_to_rest(0.0, 3**0.5, duration=4.0)
+    path = there.then(rest_to_rest(3**0.5, 12**0.5, duration=3.0))
+    jets = path.jets([0.0, 4.0, 7.0], 5)[:, 0]
+    assert not jets[1:5].any() and (jets[5] != 0.0).all() and jets[0].tolist() == [0.0, 3**0.5, 12**0.5]

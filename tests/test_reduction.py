@@ -665,11 +665,12 @@ def test_a_force_that_jumps_is_as_rough_as_a_path():
         q,
         gibbs=sv.particle(q, 1.0, x1) + sv.particle(q, 2.0, x2),
         potential=(x1 - x2) ** 2 / 2,
-        forces={"x1": ca.if_else(q.t < 1, 0, 1)},
+        forces={"x1": q.references(push=sv.paths.polynomials([0.0, 1.0, 2.0], [[0.0, 1.0]])).push},
         actuators={"f": x2},
     )
-    with refused(SpecificationError, "x1", needs=2, t=1.0):
-        derive(mechanism, sv.Program({"X": x1 - ca.sin(q.t)}))
+    model = derive(mechanism, sv.Program({"X": x1 - ca.sin(q.t)}))
+    with refused(SpecificationError, "push", "a jump", needs=2, has=-1, t=1.0):
+        sv.simulate(model, model.start(), (0.0, 2.0))
 
 
 # other roads into a reduction ----------------------------------------------------------------------------------------
@@ -743,7 +744,7 @@ def test_a_load_lifted_straight_up_hides_the_constraint_that_it_does_not_swing()
     """On the manifold sin θ is zero wherever it appears; the combination is found about the motion."""
     mechanism, program = overhead_crane()
     x, l, theta = mechanism.q
-    path = sv.paths.rest_to_rest(mechanism.q.t, 2.0, 6.0, duration=3.0, smoothness=4)
+    path = mechanism.q.references(below=sv.paths.rest_to_rest(2.0, 6.0, duration=3.0, smoothness=4)).below
     lift = sv.Program({"X": x + l * ca.sin(theta), "Z": l * ca.cos(theta) - path})
     model = derive(mechanism, lift)
     assert orders(model) == [0, 0, 0] and model.reduction.needs == {"X": 4, "Z": 4}

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
+import referred
 from refusals import refused
 
 import servoctl as sv
@@ -45,7 +46,7 @@ def beam(path):
     """A cart with a pendulum on a sloping beam whose support moves, in a wind that freshens."""
     q, p = sv.coordinates("x z theta"), sv.parameters(M=2.0, m=0.5, L=0.7, g=9.81, c=0.4)
     x, z, theta = q
-    B, W = path(q, "B", 0.0, 0.4, 1.5), path(q, "W", 0.0, 3.0, 1.0)
+    B, W = path(q, "B", 0.0, 0.4, 2.0), path(q, "W", 0.0, 3.0, 2.0)
     load = ca.vertcat(x + p.L * ca.sin(theta), z - p.L * ca.cos(theta))
     mechanism = sv.Mechanism(
         q,
@@ -65,7 +66,7 @@ def followed(q, name, start, end, duration):
 
 
 def formula(q, _name, start, end, duration):
-    return sv.paths.rest_to_rest(q.t, start, end, duration)
+    return referred.polynomial(q.t, start, end, duration)
 
 
 @pytest.fixture(scope="module", params=[carriage, beam], ids=["carriage", "beam"])

@@ -1,10 +1,11 @@
-"""Verdicts, inverses, zeros and time laws along references: those of the same path in the old spelling."""
+"""Verdicts, inverses, zeros and time laws along references."""
 
 import casadi as ca
 import numpy as np
 import pytest
 import referred
 from refusals import refused
+from scipy.integrate import solve_bvp
 
 import servoctl as sv
 from servoctl.control.time_optimal import in_formulas
@@ -21,31 +22,52 @@ def same(new, old, tolerance, names):
 
 
 def test_the_inverse_of_a_pendulum_that_stands_is_bounded_between_the_rests_of_its_path():
-    old, new = (sv.inverse(*parts(referred.cart(old=old, up=True)), (0.0, 1.0)) for old in (True, False))
-    assert "at both ends eigenvalues 4.42945, -4.42945 1/s" in new.message and new.message == old.message
-    same(new, old, 1e-11, ("theta", "force"))
-    by = [sv.sensitivity(run, "force", ["m", "L"]) for run in (new, old)]
-    for name in ("m", "L"):
-        assert np.abs(by[0]["force", name] - by[1]["force", name]).max() < 1e-8 * np.abs(by[1]["force", name]).max()
+    """L a'' = g sin a - x'' cos a by SciPy, and the force M x'' + m (x'' + L (sin a)'')."""
+    g, L, m, path = 9.81, 0.5, 0.1, sv.paths.rest_to_rest(**referred.CART)
+
+    def rates(t, y):
+        return np.array([y[1], (g * np.sin(y[0]) - path.jets(t, 2)[2, 0] * np.cos(y[0])) / L])
+
+    def ends(left, right):
+        return np.array([left[1] - (g / L) ** 0.5 * left[0], right[1] + (g / L) ** 0.5 * right[0]])
+
+    times = np.linspace(-4.0, 5.0, 1801)
+    other = solve_bvp(rates, ends, times, np.zeros((2, len(times))), tol=1e-9, max_nodes=100000)
+    mechanism, program = parts(referred.cart(up=True))
+    run = sv.inverse(mechanism, program, (0.0, 1.0))
+    assert "at both ends eigenvalues 4.42945, -4.42945 1/s" in run.message and sv.verify(run).passed
+    a, da = other.sol(run.t)
+    d2x, d2a = path.jets(run.t, 2)[2, 0], rates(run.t, (a, da))[1]
+    force = (1.0 + m) * d2x + m * L * (d2a * np.cos(a) - da**2 * np.sin(a))
+    assert np.abs(run["theta"] - a).max() < 1e-8 and np.abs(run["force"] - force).max() < 1e-6
+    by, t = sv.sensitivity(run, "force", ["m", "L"]), run.t
+    for name, value in (("m", m), ("L", L)):
+        model = run.model
+        forces = [
+            sv.simulate(model.with_parameters(**{name: value + h}), model.start(), (0.0, 1.0), "bounded", t_eval=t)["force"]
+            for h in (1e-4, -1e-4)
+        ]
+        slope, inside = (forces[0] - forces[1]) / 2e-4, (t >= 0.0) & (t <= 1.0)  # outside they fade with the window
+        assert np.abs(by["force", name] - slope)[inside].max() < 1e-6 * np.abs(slope).max()
 
 
 def test_a_report_has_the_verdict_at_both_ends_of_the_path():
-    old, new = (sv.report(referred.cart(old=old, up=True)) for old in (True, False))
-    assert repr(new).splitlines()[:2] == repr(old).splitlines()[:2] and "at both ends" in repr(new)
+    found = sv.report(referred.cart(up=True))
+    assert found.verdict == "non-minimum phase (hyperbolic)"
+    assert "at both ends eigenvalues 4.42945, -4.42945 1/s" in repr(found)
 
 
 def test_zeros_at_rest_by_a_parameter():
-    old, new = (sv.minimum_phase(referred.cart(old=old), "L", (0.2, 1.0)) for old in (True, False))
-    assert repr(new) == repr(old)
-    assert np.allclose(
-        np.sort_complex(new.polynomial.roots(0.4)), np.sort_complex(old.polynomial.roots(0.4)), rtol=1e-12
-    )
+    found = sv.minimum_phase(referred.cart(), "L", (0.2, 1.0))
+    swing = 1j * np.sqrt(9.81 / 0.4)
+    assert np.abs(np.sort_complex(found.polynomial.roots(0.4)) - [-swing, swing]).max() < 1e-11
+    assert repr(found) == repr(sv.minimum_phase(referred.cart(formula=True), "L", (0.2, 1.0)))
 
 
 def test_a_relaxed_plan_follows_the_path_as_far_as_its_weight_says():
     plans = []
-    for old in (True, False):
-        mechanism, program = parts(referred.cart(old=old, up=True))
+    for formula in (True, False):
+        mechanism, program = parts(referred.cart(formula=formula, up=True))
         plans.append(sv.relaxed(sv.plant(mechanism), program, (0.0, 1.0), weight=1e-3))
     old, new = plans
     assert np.allclose(new.t, old.t)
@@ -102,9 +124,9 @@ def test_a_time_law_is_not_sought_along_derivatives_of_references_or_of_a_refere
         sv.fastest(moved, sv.Program({"X": q[0] - r.a}), limits, (0.0, 1.0))
 
 
-def test_designs_are_those_of_the_old_spelling():
+def test_designs_are_those_along_a_formula():
     found = [
-        sv.design(referred.crane(old=old), {"m_l": (80.0, 120.0)}, (0.0, 6.0), guess={"l": 4.0})
-        for old in (True, False)
+        sv.design(referred.crane(formula=formula), {"m_l": (80.0, 120.0)}, (0.0, 6.0), guess={"l": 4.0})
+        for formula in (True, False)
     ]
     assert repr(found[0]) == repr(found[1])

@@ -17,9 +17,9 @@ def model():
     return referred.crane()
 
 
-def test_plans_with_many_parameters_are_those_of_the_old_spelling_at_once(model, monkeypatch):
+def test_plans_with_many_parameters_are_those_along_a_formula_at_once(model, monkeypatch):
     masses, times = np.linspace(50.0, 150.0, 23), np.linspace(0.0, 6.0, 31)
-    old = referred.crane(old=True)
+    old = referred.crane(formula=True)
     wanted = sv.simulate_many(old, old.start(guess={"l": 4.0}), {"m_l": masses}, (0.0, 6.0), t_eval=times)
     monkeypatch.setattr(many._Many, "_one", lambda *_: pytest.fail("one by one"))
     found = sv.simulate_many(model, model.start(guess={"l": 4.0}), {"m_l": masses}, (0.0, 6.0), t_eval=times)

@@ -1,4 +1,4 @@
-"""A start along references is that of the same path in the old spelling: the rest nearest to the guess."""
+"""A start along references is that along a formula of time: the rest nearest to the guess."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ import referred
         (referred.crane, {"t": 0.5, "guess": {"l": 4.0}}),
     ],
 )
-def test_the_start_is_that_of_the_old_spelling(make, options):
-    old, new = (make(old=old).start(**options) for old in (True, False))
+def test_the_start_is_that_along_a_formula(make, options):
+    old, new = (make(formula=formula).start(**options) for formula in (True, False))
     assert np.abs(new.values - old.values).max() < 1e-14 and new.held == old.held and new.free == old.free
     assert len(new.branches) == len(old.branches)
 

@@ -32,7 +32,7 @@ def fixed_rope_crane():
         q, gibbs=sv.particle(q, p.M, x) + sv.particle(q, p.m, load), potential=p.m * p.g * load[1], parameters=p,
         actuators={"cart": x}, outputs={"tension": tension},
     )  # fmt: skip
-    return mechanism, sv.Program({"X": load[0] - rest_to_rest(q.t, 0.0, 5.0, 6.0)})
+    return mechanism, sv.Program({"X": load[0] - q.references(X=rest_to_rest(0.0, 5.0, 6.0)).X})
 
 
 @pytest.fixture(scope="module")
@@ -187,8 +187,9 @@ def test_a_bound_keeps_the_rope_of_a_flat_crane_taut():
     """3 m down in 1.2 s: more than free fall for a while, where the exact inverse is singular."""
     mechanism, _ = overhead_crane()
     x, l, theta = mechanism.q
-    path = rest_to_rest(mechanism.q.t, (0.0, 2.0), (1.0, 5.0), 1.2)
-    program = sv.Program({"X": x + l * ca.sin(theta) - path[0], "Z": l * ca.cos(theta) - path[1]})
+    path = rest_to_rest((0.0, 2.0), (1.0, 5.0), 1.2)
+    r = mechanism.q.references(across=path[0], below=path[1])
+    program = sv.Program({"X": x + l * ca.sin(theta) - r.across, "Z": l * ca.cos(theta) - r.below})
     task = {"start": {"l": 2.0}, "bounds": {"tension": (100.0, None)}, "weight": 2e-8}
     run = sv.inverse(mechanism, program, (0.0, 1.2), **task)
     assert "relaxed, as the exact plan ends: The program is singular at t = 0.2" in run.message
@@ -224,7 +225,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing(plan):
     S = sv.particle(q, 10.0, x) + sv.particle(q, 100.0, ca.vertcat(X, Z))
     rope = ((X - x) ** 2 + Z**2 - 16.0) / 2
     absolute = sv.Mechanism(q, gibbs=S, potential=981.0 * Z, actuators={"cart": x}, constraints={"rope": rope})
-    program = sv.Program({"X": X - rest_to_rest(q.t, 0.0, 5.0, 6.0)})
+    program = sv.Program({"X": X - q.references(X=rest_to_rest(0.0, 5.0, 6.0)).X})
     run = sv.relaxed(sv.plant(absolute), program, (0.0, 6.0), weight=1e-8, start={"Z": -4.0})
     assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
     assert (run["X"] - run["x"]) ** 2 + run["Z"] ** 2 == pytest.approx(16.0, abs=1e-8)
@@ -235,7 +236,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing(plan):
     load = ca.vertcat(x + 4.0 * ca.sin(theta), -4.0 * ca.cos(theta))
     S = sv.particle(q, 10.0, x) + sv.particle(q, 100.0, load)
     other = sv.Mechanism(q, gibbs=S, potential=981.0 * load[1], actuators={"cart": x})
-    program = sv.Program({"X": load[0] - rest_to_rest(q.t, 0.0, 5.0, 6.0)})
+    program = sv.Program({"X": load[0] - q.references(X=rest_to_rest(0.0, 5.0, 6.0)).X})
     run = sv.relaxed(sv.plant(other), program, (0.0, 6.0), weight=1e-8)
     assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
     assert sv.verify(run).passed
@@ -245,15 +246,14 @@ def test_a_residual_of_third_order(crane):
     """The cart's jerk follows a path, with the states at the end given."""
     plant, _ = crane
     q = plant.mechanism.q
-    jerk = rest_to_rest(q.t, 0.0, 5.0, 6.0)
-    for _ in range(3):
-        jerk = ca.jacobian(jerk, q.t)
+    path = rest_to_rest(0.0, 5.0, 6.0)
+    (jerk,) = q.references(along=path).d(3)
     end, largest = {"x": 5.0, "theta": 0.0, "dx": 0.0, "dtheta": 0.0}, []
     for weight in (1e-3, 1e-4):
         run = sv.relaxed(plant, sv.Program({"jerk": q.d(3)[0] - jerk}), (0.0, 6.0), weight=weight, end=end)
         missed = run.residual["jerk"][0]
         measured = np.gradient(run["d2x"], run.t)
-        target = np.array(ca.Function("j", [q.t], [jerk]).map(len(run.t))(run.t[None])).ravel()
+        target = path.jets(run.t, 3)[3, 0]
         assert np.percentile(np.abs(measured - target - missed), 95) < 0.01  # the input has corners
         assert run["x"][-1] == pytest.approx(5.0, abs=1e-9) and sv.verify(run).passed
         largest.append(np.sqrt(np.mean(missed**2)))
@@ -282,7 +282,7 @@ def ball_and_beam():
     mechanism = sv.Mechanism(
         q, kinetic=kinetic, potential=p.m * p.g * r * ca.sin(alpha), parameters=p, actuators={"torque": alpha}
     )
-    return mechanism, sv.Program({"r": r - rest_to_rest(q.t, -0.3, 0.3, 3.0)}), (0.0, 3.0), 1e-6, 0.6
+    return mechanism, sv.Program({"r": r - q.references(r=rest_to_rest(-0.3, 0.3, 3.0)).r}), (0.0, 3.0), 1e-6, 0.6
 
 
 def cart_pole():
@@ -293,7 +293,8 @@ def cart_pole():
         q, gibbs=sv.particle(q, p.M, x) + sv.particle(q, p.m, bob), potential=p.m * p.g * bob[1], parameters=p,
         actuators={"force": x},
     )  # fmt: skip
-    return mechanism, sv.Program({"x": x - rest_to_rest(q.t, 0.0, 1.0, 2.0, t_start=1.5)}), (0.0, 5.0), 1e-6, 1.0
+    to = q.references(x=rest_to_rest(0.0, 1.0, 2.0, t_start=1.5))
+    return mechanism, sv.Program({"x": x - to.x}), (0.0, 5.0), 1e-6, 1.0
 
 
 def furuta():
@@ -308,7 +309,7 @@ def furuta():
     mechanism = sv.Mechanism(
         q, kinetic=kinetic, potential=p.m * p.g * bob[2], parameters=p, actuators={"torque": phi}
     )
-    program = sv.Program({"phi": phi - rest_to_rest(q.t, 0.0, np.pi / 2, 1.0, t_start=1.0)})
+    program = sv.Program({"phi": phi - q.references(phi=rest_to_rest(0.0, np.pi / 2, 1.0, t_start=1.0)).phi})
     return mechanism, program, (0.0, 3.0), 1e-4, np.pi / 2
 
 
@@ -323,7 +324,8 @@ def acrobot():
         q, gibbs=sum(sv.particle(q, p.m, c) for c in centres) + turning, parameters=p,
         potential=p.m * p.g * (centres[0][1] + centres[1][1]), actuators={"elbow": second},
     )  # fmt: skip
-    return mechanism, sv.Program({"q2": second - rest_to_rest(q.t, 0.0, 0.6, 2.0, t_start=3.0)}), (0.0, 8.0), 1e-7, 0.6
+    to = q.references(q2=rest_to_rest(0.0, 0.6, 2.0, t_start=3.0))
+    return mechanism, sv.Program({"q2": second - to.q2}), (0.0, 8.0), 1e-7, 0.6
 
 
 @pytest.mark.parametrize("scene", [ball_and_beam, cart_pole, furuta, acrobot])
@@ -364,7 +366,7 @@ def test_a_minimum_phase_plan_tends_to_the_exact_inverse_in_proportion_to_the_we
         q, gibbs=sum(sv.particle(q, p.m, c) for c in centres) + p.I * (dd1**2 + (dd1 + dd2) ** 2) / 2, parameters=p,
         potential=p.c * second**2 / 2, forces={"q2": -p.d * q.d(1)[1]}, actuators={"motor": first},
     )  # fmt: skip
-    program = sv.Program({"y": first + 0.3 * second - rest_to_rest(q.t, 0.0, np.pi / 2, 2.0)})
+    program = sv.Program({"y": first + 0.3 * second - q.references(y=rest_to_rest(0.0, np.pi / 2, 2.0)).y})
     model = sv.derive(mechanism, program)
     exact = sv.simulate(model, model.start(), (0.0, 6.0))
     errors = []
@@ -386,8 +388,9 @@ def test_two_trolleys_with_hoists_carry_a_beam():
         q, gibbs=masses + p.J * q.d(2)[4] ** 2 / 2, potential=-p.M * p.g * Z, parameters=p,
         actuators={"trolley1": x1, "trolley2": x2, "hoist1": ropes[0], "hoist2": ropes[1]},
     )  # fmt: skip
-    path = rest_to_rest(q.t, (0.0, 5.0, 0.0), (4.0, 4.0, 0.3), 5.0)
-    program = sv.Program({"X": X - path[0], "Z": Z - path[1], "phi": phi - path[2], "gap": x2 - x1 - 3.0})
+    path = rest_to_rest((0.0, 5.0, 0.0), (4.0, 4.0, 0.3), 5.0)
+    r = q.references(X=path[0], Z=path[1], phi=path[2])
+    program = sv.Program({"X": X - r.X, "Z": Z - r.Z, "phi": phi - r.phi, "gap": x2 - x1 - 3.0})
     start = {"x1": -1.5, "x2": 1.5, "X": 0.0, "Z": 5.0, "phi": 0.0}
     run = sv.relaxed(sv.plant(mechanism), program, (0.0, 5.0), weight=1e-10, start=start)
     assert sv.verify(run).passed
@@ -505,6 +508,7 @@ def test_bounds_that_admit_no_motion_are_named():
     """A metre in a second, from rest to rest, takes more than half a metre per second."""
     q = sv.coordinates("x")
     mechanism = sv.Mechanism(q, sv.particle(q, 1.0, q["x"]), actuators={"F": q["x"]})
-    program = sv.Program({"path": q["x"] - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=2)})
+    r = q.references(path=rest_to_rest(0.0, 1.0, duration=1.0, smoothness=2))
+    program = sv.Program({"path": q["x"] - r.path})
     with pytest.raises((LimitExceeded, IntegrationStopped), match=r"without them dx is 1\.87"):  # by how IPOPT ends
         sv.relaxed(sv.plant(mechanism), program, (0.0, 1.0), bounds={"dx": 0.5})

@@ -153,14 +153,17 @@ def test_a_ball_rests_on_a_level_beam_alone(gallery_model):
 # traps ----------------------------------------------------------------------------------------------------------------
 
 
-def crane(output=lambda x, theta: x + 4 * ca.sin(theta), path=None):
+def crane(output=lambda x, theta: x + 4 * ca.sin(theta), path=None, end=5.0):
     """A cart of 10 kg with a load of 100 kg on a rope of 4 m; by default the load's x goes to 5 m in 6 s."""
     q = sv.coordinates("x theta")
     x, theta = q
     S = sv.particle(q, 10.0, (x, 0)) + sv.particle(q, 100.0, (x + 4 * ca.sin(theta), 4 * ca.cos(theta)))
     mechanism = sv.Mechanism(q, gibbs=S, potential=-3924.0 * ca.cos(theta), actuators={"F": x})
-    path = path or (lambda t: sv.paths.rest_to_rest(t, 0.0, 5.0, duration=6.0, smoothness=4))
-    return mechanism, sv.Program({"X": output(x, theta) - path(q.t)})
+    if path is None:
+        path = q.references(X=sv.paths.rest_to_rest(0.0, end, duration=6.0, smoothness=4)).X
+    else:
+        path = path(q.t)
+    return mechanism, sv.Program({"X": output(x, theta) - path})
 
 
 def cart(x, _):
@@ -184,7 +187,7 @@ def test_ball_and_beam_is_singular_at_rest():
     r, a = q
     S = sv.particle(q, 0.1, (r * ca.cos(a), r * ca.sin(a))) + 0.02 * q.d(2)[1] ** 2 / 2
     mechanism = sv.Mechanism(q, gibbs=S, potential=0.981 * r * ca.sin(a), actuators={"torque": a})
-    path = sv.paths.rest_to_rest(q.t, 0.1, 0.4, duration=3.0, smoothness=4)
+    path = q.references(r=sv.paths.rest_to_rest(0.1, 0.4, duration=3.0, smoothness=4)).r
     found = verdict(sv.derive(mechanism, sv.Program({"r": r - path})))
     assert found.word == "singular at rest" and "r 4" in found.reason and "r 3" in found.reason
 
@@ -202,11 +205,7 @@ def test_the_pose_of_a_pendulum_on_a_cart_decides(pose, word, rate):
 
 def test_a_double_zero_eigenvalue_is_on_the_axis():
     """The angle of the rope is programmed: the cart may stand anywhere, x'' = f(θ), and runs away where θ stays."""
-
-    def tilt(t):
-        return sv.paths.rest_to_rest(t, 0.0, 0.3, duration=6.0, smoothness=4)
-
-    found = verdict(sv.derive(*crane(lambda x, theta: theta, tilt)))
+    found = verdict(sv.derive(*crane(lambda x, theta: theta, end=0.3)))
     assert found.word == "marginal" and found.rest["end"].moving and not found.rest["start"].moving
 
 
@@ -216,7 +215,7 @@ def mathieu():
     y, x = q
     forces = {"x": -0.1 * q.d(1)[1] - (1 + 0.6 * ca.cos(2 * q.t)) * x}
     S = sv.particle(q, 1.0, (y, 0)) + sv.particle(q, 1.0, (x, 0))
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    path = q.references(y=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=4)).y
     mechanism = sv.Mechanism(q, gibbs=S, forces=forces, actuators={"F": y}, outputs={"free": x})
     return sv.derive(mechanism, sv.Program({"y": y - path}))
 
@@ -255,7 +254,7 @@ def test_more_actuators_than_residuals_are_undetermined():
     q = sv.coordinates("x")
     (x,) = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, (x, 0, 0)), actuators={"left": x, "right": x})
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    path = q.references(x=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=4)).x
     found = verdict(sv.derive(mechanism, sv.Program({"x": x - path})))
     assert found.word == "undetermined" and found.dynamics == "flat" and "left, right" in found.reason
 
@@ -280,7 +279,7 @@ def test_units_change_no_verdict(unit, upright):
         q, gibbs=S, potential=sign * 0.2 * 9.81 * unit * 0.5 * unit * ca.cos(a), actuators={"F": x},
         forces={"a": -0.01 * unit**2 * q.d(1)[1]},
     )  # fmt: skip
-    path = unit * sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=4)
+    path = unit * q.references(x=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=4)).x
     found = verdict(sv.derive(mechanism, sv.Program({"x": x - path})))
     expected = np.roots([1.0, 0.2, -sign * 9.81 / 0.5])
     assert found.word == ("non-minimum phase (hyperbolic)" if upright else "minimum phase")
@@ -451,7 +450,7 @@ def test_self_motion_is_reported_and_whether_it_is_damped(friction, said):
     x, y = q
     S, forces = sv.particle(q, 2.0, ca.vertcat(x, y)), {"y": -friction * q.d(1)[1]}
     mechanism = sv.Mechanism(q, gibbs=S, forces=forces, actuators={"Fx": x, "Fy": y})
-    report = sv.report(mechanism, sv.Program({"x": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 1.0)}))
+    report = sv.report(mechanism, sv.Program({"x": x - q.references(x=sv.paths.rest_to_rest(0.0, 1.0, 1.0)).x}))
     assert f"self-motion of 1 velocity, {said}" in str(report)
     facts = report.as_dict()["self_motion"]
     assert facts["velocities"] == 1 and facts["rate"] == pytest.approx(-friction / 2)
@@ -472,7 +471,8 @@ def beside(force, path=None):
     S = sv.particle(q, 1.0, x) + sv.particle(q, 1.0, y)
     free = {"free": y}  # an output, so that no free mass is left out
     mechanism = sv.Mechanism(q, gibbs=S, actuators={"F": x}, forces=ca.vertcat(0, force(x, y, dy)), outputs=free)
-    path = path if path is not None else sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    if path is None:
+        path = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=4)).X
     return mechanism, sv.Program({"X": x - path})
 
 
@@ -565,7 +565,7 @@ def ballbot(roll, gravity=9.81):
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=gravity * 0.6 * ca.cos(a), actuators={"T": phi - a}, constraints={"roll": roll(q)}
     )
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=4)
+    path = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=4)).X
     return sv.derive(mechanism, sv.Program({"X": x - path}))
 
 

@@ -27,9 +27,9 @@ def place(robot, link, posture):
 def arm_plan(duration=2.0):
     """The six-axis arm along a line with a turn."""
     arm = sv.urdf(robots.file_of("six_axis_arm"))
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, duration)
+    s = arm.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration)).s
     position, rotation = place(arm, "tool", HOME)
-    line = sv.paths.line(s, position.ravel(), position.ravel() + [0.05, -0.15, -0.1])
+    line = sv.curves.line(s, position.ravel(), position.ravel() + [0.05, -0.15, -0.1])
     pose = sv.programs.pose("tool", arm.frame("tool"), line, sv.rotations.turn(0.6 * s, (0, 0, 1), rotation))
     mechanism = arm.mechanism()
     model = sv.derive(mechanism, sv.Program(pose))
@@ -41,8 +41,8 @@ def quadruped_plan():
     """The quadruped on four point feet moves its trunk."""
     robot = sv.urdf(robots.file_of("quadruped"), base="free")
     rows = sv.held(robot, {f"{leg}_foot": "position" for leg in LEGS}, STANDING)
-    s = sv.paths.rest_to_rest(robot.q.t, 0.0, 1.0, 1.2)
-    line, turn = sv.paths.line(s, (0, 0, 0.3), (0.03, 0.02, 0.26)), sv.rotations.turn(0.15 * s, (0, 0, 1))
+    s = robot.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 1.2)).s
+    line, turn = sv.curves.line(s, (0, 0, 0.3), (0.03, 0.02, 0.26)), sv.rotations.turn(0.15 * s, (0, 0, 1))
     mechanism = robot.mechanism(rows)
     model = sv.derive(mechanism, sv.Program(sv.programs.pose("trunk", robot.frame("trunk"), line, turn)))
     return robot, mechanism, model, sv.simulate(model, model.start(guess=STANDING | {"base_qw": 1.0}), (0.0, 1.2))
@@ -114,7 +114,7 @@ def test_a_four_bar_is_closed_in_its_plane():
     assert list(sv.loop(*ends, "position")) == ["loop_x", "loop_z"]
     assert list(sv.loop(*ends, "pose")) == ["loop_x", "loop_z", "loop_ry"]
     mechanism = arm.mechanism(sv.loop(*ends, "position"), actuators=("crank_joint",))
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, 2.0)
+    s = arm.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 2.0)).s
     model = sv.derive(mechanism, sv.Program({"crank": arm.q["crank_joint"] + 1.0 + 2.0 * s}))
     start = model.start(guess={"crank_joint": -1.0, "coupler_joint": 1.0, "rocker_joint": -1.2})
     run = sv.simulate(model, start, (0.0, 2.0))
@@ -148,8 +148,8 @@ def test_a_parallel_robot_takes_the_torques_of_pinocchio(tmp_path):
     ends = robot.frame("left_end"), robot.frame("right_end")
     mechanism = robot.mechanism(sv.loop(*ends, "position"), actuators=("left_motor", "right_motor"))
     home = {"left_motor": -2.2, "left_elbow": 1.2, "right_motor": -0.9, "right_elbow": -1.2}
-    s = sv.paths.rest_to_rest(robot.q.t, 0.0, 1.0, 1.5)
-    line = sv.paths.line(s, (0.0, 0.56), (0.08, 0.5))
+    s = robot.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 1.5)).s
+    line = sv.curves.line(s, (0.0, 0.56), (0.08, 0.5))
     point = ends[0].position[[0, 2]]
     model = sv.derive(mechanism, sv.Program({"X": point[0] - line[0], "Z": point[1] - line[1]}))
     run = sv.simulate(model, model.start(guess=home), (0.0, 1.5))
@@ -276,7 +276,7 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
         (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), 2.0 * np.eye(3)), "no rotation"),
         (lambda q: sv.programs.orientation("p", sv.rotations.turn(q["x"], (0, 0, 1)), np.diag([1, 1, -1])), "no rotation"),
         (lambda q: sv.rotations.turn(q["x"], (0, 0, 1), np.zeros((3, 3))), "no rotation"),
-        (lambda q: sv.rotations.spline(q.t, [], []), "rotation"),
+        (lambda q: sv.rotations.vectors([]), "rotation"),
         (lambda q: sv.programs.follow_point("p", (q["x"], q["y"]), (1,)), "2 entries with 1"),
         (lambda q: sv.programs.curvature("p", q, (q["x"], q["y"], 0), 1.0), "3 entries"),
         (lambda q: sv.programs.follow_path("p", (q["x"],), q["y"], q.t), "follow_point"),
@@ -310,22 +310,38 @@ def test_turns_and_slerps_are_rotations_at_an_even_rate():
     assert max(np.abs(r.T @ r - np.eye(3)).max() for r in values) < 1e-14
 
 
-def test_a_spline_passes_through_rotations():
-    t, times = ca.SX.sym("t"), [0.0, 1.0, 1.5, 3.0]
-    through = [np.array(ca.DM(ca.evalf(sv.rotations.turn(angle, (1, angle, 0.3))))) for angle in (0.1, 0.9, 1.4, -0.5)]
-    path = sv.rotations.spline(t, times, through, smoothness=3)
-    for value, wanted in zip(numbers_of(path, t, times), through, strict=True):
-        assert np.abs(value - wanted).max() < 1e-12
-    for value in numbers_of(path, t, np.linspace(-0.5, 3.5, 9)):
+def test_a_path_passes_through_measured_rotations():
+    """Rotations at given times, as three references about the middle one, and a body that is told to follow them."""
+    times, turns = [0.0, 1.0, 1.5, 3.0], [(0.1, 0.1), (0.9, 0.9), (1.4, 1.4), (-0.5, -0.5)]
+    through = [np.array(ca.DM(ca.evalf(sv.rotations.turn(angle, (1, x, 0.3))))) for angle, x in turns]
+    vectors, middle = sv.rotations.vectors(through)
+    path = sv.paths.spline(times, vectors, smoothness=3)
+    q = sv.coordinates("a b c")
+    r = q.references(rx=path[0], ry=path[1], rz=path[2])
+    rotation = middle @ sv.rotations.from_vector([*r])
+    at = ca.Function("at", [ca.vertcat(*r)], [rotation])
+    for t, wanted in zip(times, through, strict=True):
+        assert np.abs(np.array(at(path(t))) - wanted).max() < 1e-12
+    for t in np.linspace(-0.5, 3.5, 9):
+        value = np.array(at(path(t)))
         assert np.abs(value.T @ value - np.eye(3)).max() < 1e-13
-    vector = sv.rotations.vector(path)
-    assert np.abs(np.array(ca.evalf(ca.substitute(sv.rotations.from_vector(vector) - path, t, 0.4)))).max() < 1e-14
+        assert np.abs(np.array(ca.DM(sv.rotations.vector(middle.T @ value))).ravel() - path(t)).max() < 1e-13
+
+    axes = sv.rotations.turn(q["a"], (0, 0, 1)) @ sv.rotations.turn(q["b"], (0, 1, 0)) @ sv.rotations.turn(q["c"], (1, 0, 0))
+    body = sv.Mechanism(q, sv.rigid_body(q, 0.0, (1, 2, 3), rates=sv.body_rates(q, axes)), actuators=dict(zip("uvw", q, strict=True)))
+    model = sv.derive(body, sv.Program(sv.programs.orientation("turned", axes, rotation), by="actuators"))
+    run = sv.simulate(model, model.start(), (0.0, 3.0), t_eval=times)
+    followed = ca.Function("followed", [ca.vertcat(*q)], [axes])
+    for k, wanted in enumerate(through):
+        assert np.abs(np.array(followed([run[name][k] for name in "abc"])) - wanted).max() < 1e-10
 
 
 def test_rotations_refuse_half_turns_and_what_is_none():
     half = np.diag([1.0, -1.0, -1.0])
     with refused(sv.errors.SpecificationError, "half a turn"):
         sv.rotations.slerp(0.5, np.eye(3), half)
+    with refused(sv.errors.SpecificationError, "rotations[0]", "half a turn"):
+        sv.rotations.vectors([half, np.eye(3)])
     with refused(sv.errors.SpecificationError, "start"):
         sv.rotations.slerp(0.5, np.diag([1.0, 1.0, -1.0]), np.eye(3))
     with refused(sv.errors.SpecificationError, "axis", axis=[0, 0, 0]):

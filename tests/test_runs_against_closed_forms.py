@@ -297,7 +297,7 @@ def arm_determinant(links, Gamma, q2):
     model = arm(links, Gamma)
     x = np.zeros(4)
     x[[model.state_names.index("q1"), model.state_names.index("q2")]] = np.pi / 2 - Gamma * q2, q2
-    return np.linalg.det(model.function("matrices")(10.0, x, model.parameters)[:4].reshape(2, 2))
+    return np.linalg.det(model.function("matrices")(10.0, x, model.p)[:4].reshape(2, 2))
 
 
 @pytest.mark.parametrize("links", LINKS)
@@ -362,9 +362,10 @@ def test_only_the_flat_point_of_the_vtol_is_flat(shift, free):
     assert float(ca.substitute(height, ca.vertcat(*p.symbols), p.values())) / (1 + shift) == pytest.approx(
         0.0433649377, abs=5e-11
     )
-    path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=4)
+    path = sv.paths.rest_to_rest((0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=4)
+    r = mechanism.q.references(across=path[0], up=path[1])
     point = ca.vertcat(x - height * ca.sin(theta), z + height * ca.cos(theta))
-    model = sv.derive(mechanism, sv.Program({"X": point[0] - path[0], "Z": point[1] - path[1]}))
+    model = sv.derive(mechanism, sv.Program({"X": point[0] - r.across, "Z": point[1] - r.up}))
     assert model.free == free
 
 

@@ -11,7 +11,7 @@ from servoctl.control.sampling import sampled_radii
 q = sv.coordinates("x")
 (x,) = q
 POINT = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), actuators={"force": x})
-POINT_PROGRAM = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0, smoothness=3)})
+POINT_PROGRAM = sv.Program({"X": x - q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0, smoothness=3)).X})
 
 
 @pytest.mark.parametrize("late", [0.0, 0.004, 0.01, 0.013, 0.027])

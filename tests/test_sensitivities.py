@@ -122,12 +122,15 @@ def test_a_damped_mass(method):
     assert s["d2x", "c"] == pytest.approx(-3 / 2 * decay * (1 - t / 4), abs=1e-8)
 
 
+SWITCHED_OFF = sv.paths.polynomials([0.0, 1.0, 2.0], [[1.0, 0.0]])  # 1 until t = 1, then 0
+
+
 def test_a_force_that_ends_at_a_parameter():
     """x'' = F until T: x = F T (t - T/2) afterwards, so that ∂x/∂T = F (t - T) and ∂x'/∂T = F."""
     p = sv.parameters(T=1.3, F=2.0)
     q = sv.coordinates("x")
     (x,) = q
-    force = {"x": ca.if_else(q.t < p.T, p.F, 0.0)}
+    force = {"x": p.F * q.references(on=SWITCHED_OFF.at_rate(1 / p.T, 0.0)).on}
     plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), forces=force, parameters=p))
     for span in ((0.0, 3.0), (3.0, 0.0)):
         run = sv.simulate(plant, {"x": 0.0, "dx": 0.0}, span, "DOP853")
@@ -166,7 +169,7 @@ def test_a_knot_before_the_first_sample(times):
     p = sv.parameters(T=1.3, F=2.0)
     q = sv.coordinates("x")
     (x,) = q
-    force = {"x": ca.if_else(q.t < p.T, p.F, 0.0)}
+    force = {"x": p.F * q.references(on=SWITCHED_OFF.at_rate(1 / p.T, 0.0)).on}
     plant = sv.plant(sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), forces=force, parameters=p))
     run = sv.simulate(plant, {"x": 0.0, "dx": 0.0}, (0.0, 3.0), "DOP853", t_eval=times)
     s, after = sv.sensitivity(run, ["x", "dx"]), run.t > 1.3
@@ -175,14 +178,14 @@ def test_a_knot_before_the_first_sample(times):
     assert s["dx", "F"] == pytest.approx(np.minimum(run.t, 1.3), abs=1e-8)
 
 
-def two_masses(path=lambda t: 0.5 * ca.sin(t)):
+def two_masses(path=lambda q: 0.5 * ca.sin(q.t)):
     """A driven mass with a second one, which the program leaves free, on a spring and a damper."""
     p = sv.parameters(k=5.0, d=0.4)
     x, y = q = sv.coordinates("x y")
     force = p.k * (x - y) + p.d * (q.d(1)[0] - q.d(1)[1])
     S = sv.particle(q, 1.0, x) + sv.particle(q, 2.0, y)
     mechanism = sv.Mechanism(q, S, actuators={"F": x}, forces=ca.vertcat(-force, force), parameters=p)
-    return sv.derive(mechanism, sv.Program({"X": x - path(q.t)}))
+    return sv.derive(mechanism, sv.Program({"X": x - path(q)}))
 
 
 @pytest.mark.parametrize("drift", [None, "project", 0.1])
@@ -234,7 +237,7 @@ def test_what_is_refused(crane):
 
 
 def test_derivatives_of_a_plan_of_the_plant_hold_its_inputs():
-    model = two_masses(lambda t: sv.paths.rest_to_rest(t, 0.0, 1.0, 2.0))
+    model = two_masses(lambda q: q.references(X=sv.paths.rest_to_rest(0.0, 1.0, 2.0)).X)
     r = model.reduction
     plan = sv.relaxed(sv.plant(r.mechanism), r.program, (0.0, 2.0))
     s = sv.sensitivity(plan, "y", "k")

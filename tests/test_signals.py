@@ -26,8 +26,9 @@ def carriage():
         forces={"x": drag, "phi": drag * p.l * ca.cos(phi)}, actuators={"force": x, "torque": phi},
         outputs={"drag": drag},
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.0), end=(1.0, 0.3), duration=1.5, smoothness=4)
-    model = sv.derive(mechanism, sv.Program({"x": x - path[0], "phi": phi - path[1]}, by="actuators"))
+    path = sv.paths.rest_to_rest(start=(0.0, 0.0), end=(1.0, 0.3), duration=1.5, smoothness=4)
+    r = q.references(x=path[0], phi=path[1])
+    model = sv.derive(mechanism, sv.Program({"x": x - r.x, "phi": phi - r.phi}, by="actuators"))
     return sv.simulate(model, model.start(0.0), (0.0, 1.5)), sv.plant(mechanism)
 
 

@@ -287,7 +287,7 @@ def test_a_quaternion_and_its_opposite_are_one_start():
 
 def path_from_rest(q, speed=0.0):
     """3 s, sin 2s along s, which begins with the slope 2/3 and the curvature 0."""
-    s = sv.paths.rest_to_rest(q.t, (0.0,), (1.0,), duration=4.0, smoothness=5)[0] + speed * q.t
+    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=4.0, smoothness=5)).s + speed * q.t
     return 3 * s, ca.sin(2 * s)
 
 
@@ -416,8 +416,9 @@ def test_a_car_at_rest_is_told_so_whatever_swings_on_it():
         constraints={"no slip": dx * ca.sin(psi) - dy * ca.cos(psi)},
         potential=-9.81 * 0.3 * ca.cos(phi),
     )
-    path = sv.paths.rest_to_rest(q.t, (0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=6)
-    model = sv.derive(mechanism, sv.Program({"X": x - path[0], "Y": y - path[1]}, by="actuators"))
+    path = sv.paths.rest_to_rest((0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=6)
+    r = q.references(X=path[0], Y=path[1])
+    model = sv.derive(mechanism, sv.Program({"X": x - r.X, "Y": y - r.Y}, by="actuators"))
     for t, remedy in ((0.1, ""), (4.5, "End the motion before")):  # rounding decides how near it the first one comes
         with refused(sv.errors.SingularProgram, "stands still", remedy, rates=()):
             sv.simulate(model, model.start(t=t), (t, 6.0))
@@ -431,12 +432,11 @@ def test_a_path_beyond_the_reach_of_an_arm_is_told_to_keep_within():
     a, b = q
     hand = ca.vertcat(ca.cos(a) + ca.cos(a + b), ca.sin(a) + ca.sin(a + b))
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, hand), actuators={"shoulder": a, "elbow": b})
-    out = sv.paths.rest_to_rest(q.t, 1.0, 2.3, 2.0)
-    model = sv.derive(mechanism, sv.Program({"X": hand[0] - out, "Y": hand[1]}), guess={"a": 1.0, "b": -2.0})
+    path = sv.paths.rest_to_rest(1.0, 2.3, 2.0)
+    model = sv.derive(mechanism, sv.Program({"X": hand[0] - q.references(X=path).X, "Y": hand[1]}), guess={"a": 1.0, "b": -2.0})
     with refused(sv.errors.SingularProgram, "'X'", "reaches", rows=["X"]) as caught:
         sv.simulate(model, model.start(guess={"a": 1.0, "b": -2.0}), (0.0, 2.0))
-    reach = ca.Function("reach", [q.t], [out])(caught.value.details["t"])
-    assert float(reach) == pytest.approx(2.0, abs=1e-6)
+    assert path(caught.value.details["t"]) == pytest.approx(2.0, abs=1e-6)
 
 
 def test_an_actuator_that_acts_on_no_residual_is_not_told_to_write_residuals_otherwise():
@@ -452,7 +452,7 @@ def rolled(path, duration=4.0):
     model = bicycle()
     q = model.reduction.mechanism.q
     x, y, *_ = q
-    s = sv.paths.rest_to_rest(q.t, (0.0,), (1.0,), duration=duration, smoothness=6)[0]
+    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=duration, smoothness=6)).s
     X, Y = path(s)
     return sv.derive(model.reduction.mechanism, sv.Program({"X": x - X, "Y": y - Y}))
 
@@ -529,7 +529,7 @@ def follower():
 
 
 def bent(q):
-    return sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=4.0, smoothness=6)
+    return q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=4.0, smoothness=6)).s
 
 
 def headed(mechanism, angle, target=bent, rate=False):
@@ -701,8 +701,9 @@ def test_an_output_that_is_held_at_a_standstill(by):
         actuators={"drive": (ca.cos(psi), ca.sin(psi), 0), "steer": psi},
         constraints={"no slip": dx * ca.sin(psi) - dy * ca.cos(psi)},
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, (0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=4)
-    model = sv.derive(robot, sv.Program({"X": x - path[0], "Y": y - path[1]}))
+    path = sv.paths.rest_to_rest((0.0, 0.0), (3**0.5, 1.0), duration=4.0, smoothness=4)
+    r = q.references(X=path[0], Y=path[1])
+    model = sv.derive(robot, sv.Program({"X": x - r.X, "Y": y - r.Y}))
     held = {"output": {"heading": 0.6}, "condition": {"hold": {"angle": psi - 0.3}}, "coordinate": {"psi": 0.3}}[by]
     assert model.start(**held)["psi"] == pytest.approx(0.3)
 

@@ -84,8 +84,9 @@ def slewing_crane(damping=C):
         forces={"theta": -damping * q.d(1)[3], "phi": -damping * q.d(1)[4]},
         actuators={"slew": slew, "luff": luff, "hoist": l},
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, BEGIN, END, duration=LASTS, smoothness=4)
-    return mechanism, sv.Program({name: load[i] - path[i] for i, name in enumerate("XYZ")})
+    path = sv.paths.rest_to_rest(BEGIN, END, duration=LASTS, smoothness=4)
+    r = q.references(X=path[0], Y=path[1], Z=path[2])
+    return mechanism, sv.Program({name: load[i] - r[name] for i, name in enumerate("XYZ")})
 
 
 def crane_forces(times):
@@ -152,9 +153,10 @@ def elastic_arm():
     heights = [m * G * r[1] for m, r in zip(MASSES, links(q[0], q[1]), strict=True)]
     U = sum(heights) + sum(0.5 * k * (q[i] - q[2 + i]) ** 2 for i, k in enumerate(STIFF))
     mechanism = sv.Mechanism(q, S, potential=U, actuators={"motor1": q[2], "motor2": q[3]})
-    path = sv.paths.rest_to_rest(q.t, *LINE, duration=STROKE, smoothness=4)
+    path = sv.paths.rest_to_rest(*LINE, duration=STROKE, smoothness=4)
+    r = q.references(x=path[0], y=path[1])
     tip = links(q[0], q[1])[1]
-    return mechanism, sv.Program({"x": tip[0] - path[0], "y": tip[1] - path[1]})
+    return mechanism, sv.Program({"x": tip[0] - r.x, "y": tip[1] - r.y})
 
 
 def elastic_forces(times, bend):

@@ -141,14 +141,15 @@ def test_the_essential_order_is_the_class_that_a_path_needs():
     p = mechanism.parameters
     x, z, theta = mechanism.q
     height = p.J * ca.sin(p.tilt) / (p.M * (p.l * ca.cos(p.tilt) + p.h * ca.sin(p.tilt)))
-    for smoothness in (3, 4):
-        path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=smoothness)
-        program = sv.Program({"X": x - height * ca.sin(theta) - path[0], "Z": z + height * ca.cos(theta) - path[1]})
-        if smoothness == 3:
-            with refused(sv.errors.SpecificationError, needs=4, has=3):
-                sv.derive(mechanism, program)
-        else:
-            assert sv.derive(mechanism, program).flat
+    paths = [sv.paths.rest_to_rest((0.0, 0.0), (5.0, 2.0), duration=4.0, smoothness=k) for k in (3, 4)]
+    r = mechanism.q.references(across=None, up=None)
+    program = sv.Program({"X": x - height * ca.sin(theta) - r.across, "Z": z + height * ca.cos(theta) - r.up})
+    model = sv.derive(mechanism, program)
+    assert model.flat
+    rough, smooth = (model.with_references(across=path[0], up=path[1]) for path in paths)
+    assert sv.simulate(smooth, smooth.start(), (0.0, 5.0)).success
+    with refused(sv.errors.SpecificationError, needs=4, has=3, t=4.0):
+        sv.simulate(rough, rough.start(), (0.0, 5.0))
 
 
 # units and margins ---------------------------------------------------------------------------------------------------
@@ -192,7 +193,10 @@ def fixed_rope_crane(length=1.0, target=None, damping=0.0):
     q = sv.coordinates("x theta")
     x, theta = q
     load = ca.vertcat(x + length * ca.sin(theta), -length * ca.cos(theta))
-    path = sv.paths.rest_to_rest(q.t, (0.0,), (3.0,), duration=4.0, smoothness=4)[0] if target is None else target(q.t)
+    if target is None:
+        path = q.references(X=sv.paths.rest_to_rest(0.0, 3.0, duration=4.0, smoothness=4)).X
+    else:
+        path = target(q.t)
     mechanism = sv.Mechanism(
         q, gibbs=sv.particle(q, 10.0, x) + sv.particle(q, 2.0, load), potential=2.0 * 9.81 * load[1],
         forces={"x": -damping * q.dt(x)}, actuators={"force": x},
@@ -317,8 +321,9 @@ def test_a_load_is_judged_where_its_angles_are_regular(chart):
         load += ca.vertcat(ca.cos(b) * ca.sin(a), ca.sin(b), -ca.cos(a) * ca.cos(b))
     S = sv.particle(q, 1.0, ca.vertcat(x, y, z)) + sv.particle(q, 0.4, load)
     vehicle = sv.Mechanism(q, S, 9.81 * (z + 0.4 * load[2]), {"Fx": x, "Fy": y, "Fz": z})
-    path = sv.paths.rest_to_rest(q.t, (0.0, 0.0, 0.0), (3.0, 2.0, 1.0), duration=4.0)
-    model = sv.derive(vehicle, sv.Program({name: load[i] - path[i] for i, name in enumerate("XYZ")}))
+    path = sv.paths.rest_to_rest((0.0, 0.0, 0.0), (3.0, 2.0, 1.0), duration=4.0)
+    r = q.references(X=path[0], Y=path[1], Z=path[2])
+    model = sv.derive(vehicle, sv.Program({name: load[i] - r[name] for i, name in enumerate("XYZ")}))
     structure = model.structure()
     assert structure.zeros_at_infinity == (2, 4, 4) and "differs" not in str(structure)
     plan = sv.simulate(model, model.start(), (0.0, 4.0), t_eval=np.linspace(0.0, 4.0, 101))

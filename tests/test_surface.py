@@ -194,7 +194,7 @@ def large():
         q, gibbs=sum(sv.particle(q, 2.0, x) for x in q), actuators={f"motor{i}": x for i, x in enumerate(q)},
         outputs={f"output{i}": x + 1.0 for i, x in enumerate(q)},
     )  # fmt: skip
-    moved = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0)
+    moved = q.references(moved=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0)).moved
     program = sv.Program({f"residual{i}": x - moved * (i == 0) for i, x in enumerate(q)})
     model = sv.derive(mechanism, program)
     return sv.simulate(model, model.start(), (0.0, 1.0), t_eval=np.linspace(0.0, 1.0, 21))

@@ -558,27 +558,27 @@ def test_derivatives_of_quotients_that_may_overflow_are_differentiated_again(div
     assert first == pytest.approx(second, rel=1e-13)
 
 
-PULSES = {  # of time alone, or of the place x = t: their impulse is 1, about t = 1
-    "by fabs": lambda t: ca.if_else(ca.fabs(t - 1) < 0.002, 250.0, 0.0),
-    "by a square": lambda t: ca.if_else((t - 1.00037) ** 2 < 4e-6, 250.0, 0.0),
-    "of 20 us by a square": lambda t: ca.if_else((t - 1.00037) ** 2 < 1e-10, 5e4, 0.0),
-    "by both sides": lambda t: ca.if_else(ca.logic_and(t > 0.998, t < 1.002), 250.0, 0.0),
+PULSES = {  # of the place x = t: their impulse is 1, about t = 1
+    "by fabs": lambda x: ca.if_else(ca.fabs(x - 1) < 0.002, 250.0, 0.0),
+    "by a square": lambda x: ca.if_else((x - 1.00037) ** 2 < 4e-6, 250.0, 0.0),
+    "of 20 us by a square": lambda x: ca.if_else((x - 1.00037) ** 2 < 1e-10, 5e4, 0.0),
+    "by both sides": lambda x: ca.if_else(ca.logic_and(x > 0.998, x < 1.002), 250.0, 0.0),
 }
 
 
 @pytest.mark.parametrize(
-    ("name", "of", "methods"),
+    ("name", "methods"),
     [
-        ("by both sides", "place", METHODS),
-        ("by fabs", "time", ("DOP853", "Taylor")),
-        ("by a square", "place", ("DOP853", "Taylor")),
-        ("of 20 us by a square", "time", ("LSODA", "Taylor")),
+        ("by both sides", METHODS),
+        ("by fabs", ("DOP853", "Taylor")),
+        ("by a square", ("DOP853", "Taylor")),
+        ("of 20 us by a square", ("LSODA", "Taylor")),
     ],
 )
-def test_two_switches_within_a_step_are_both_met(name, of, methods):
+def test_two_switches_within_a_step_are_both_met(name, methods):
     pulse = PULSES[name]
     for method in methods:
-        model, start = pushed(lambda t, x, y: pulse(t if of == "time" else x), 0.0, 0.0)
+        model, start = pushed(lambda t, x, y: pulse(x), 0.0, 0.0)
         run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
         middle = 1.00037 if "square" in name else 1.0
         assert run["dy"][-1] == pytest.approx(1.0, abs=1e-6)
@@ -586,9 +586,40 @@ def test_two_switches_within_a_step_are_both_met(name, of, methods):
         assert len(run.knots) >= 2
 
 
-def test_a_square_wave_switches_every_time():
-    """The triangle of its impulse ends at 2 - 25 π/40, with 26 changes of the sign of sin 40 t up to 2 s."""
-    model, start = pushed(lambda t, x, y: ca.sign(ca.sin(40 * t)), 0.0, 0.0)
+@pytest.mark.parametrize("half", [0.002, 1e-5])
+def test_a_pulse_along_a_path_is_met_at_both_breaks(half):
+    """A piece of 20 µs or 4 ms between breaks at which a force jumps."""
+    path = sv.paths.polynomials([0.0, 1.00037 - half, 1.00037 + half, 2.0], [[0.0, 0.5 / half, 0.0]])
+    for method in METHODS:
+        model, start = along(path)
+        run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])
+        assert [run["y"][-1], run["dy"][-1]] == pytest.approx([2.0 - 1.00037, 1.0], abs=1e-6)
+        assert run.knots == tuple(path.breaks[1:-1])
+
+
+def along(path):
+    """As `pushed`, under a force that follows a path."""
+    q = sv.coordinates("x y")
+    x, _ = q
+    gibbs = ca.sumsqr(ca.vertcat(*q.d(2))) / 2
+    mechanism = sv.Mechanism(q, gibbs=gibbs, forces={"y": q.references(push=path).push}, actuators={"F": x})
+    model = sv.derive(mechanism, sv.Program({"x": x - q.t}), keep=q.names)
+    return model, model.start(y=0.0, dy=0.0)
+
+
+def test_a_square_wave_along_a_path_jumps_every_time():
+    """The triangle of its impulse ends at 2 - 25 π/40, with 26 jumps up to 2 s: a period that is repeated."""
+    half = np.pi / 40
+    wave = sv.paths.polynomials([0.0, half, 2 * half], [[1.0, -1.0]], before="periodic", after="periodic")
+    model, start = along(wave)
+    for method in ("DOP853", "Taylor", "RadauIIA", "RK4"):
+        run = sv.simulate(model, start, (0.0, 2.0), method)
+        assert run["dy"][-1] == pytest.approx(np.pi / 40 - (2 - 25 * np.pi / 40), abs=1e-7)
+
+
+def test_a_square_wave_of_a_place_switches_every_time():
+    """The same along x = t, by the sign of sin 40 x."""
+    model, start = pushed(lambda t, x, y: ca.sign(ca.sin(40 * x)), 0.0, 0.0)
     for method in ("DOP853", "Taylor", "RadauIIA", "RK4"):
         run = sv.simulate(model, start, (0.0, 2.0), method)
         assert run["dy"][-1] == pytest.approx(np.pi / 40 - (2 - 25 * np.pi / 40), abs=1e-7)
@@ -655,16 +686,16 @@ def test_a_flat_angle_turns_round_and_round(span):
 
 
 def rubbed(path):
-    """A driven mass on x along a path of t, with dry friction of 0.3 N."""
+    """A driven mass on x along a path, with dry friction of 0.3 N."""
     q = sv.coordinates("x")
     (x,), (dx,) = q, q.d(1)
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), actuators={"u": x}, forces={"x": -0.3 * ca.sign(dx)})
-    return sv.derive(mechanism, sv.Program({"X": x - path(q.t)}))
+    return sv.derive(mechanism, sv.Program({"X": x - path(q)}))
 
 
 def test_dry_friction_along_a_flat_program():
     """u = 2 x'' + 0.3 sign x', x = 1 + sin t."""
-    model = rubbed(lambda t: 1 + ca.sin(t))
+    model = rubbed(lambda q: 1 + ca.sin(q.t))
     run = sv.simulate(model, model.start(), (0.0, 10.0), t_eval=np.linspace(0.0, 10.0, 777))
     assert run["u"] == pytest.approx(-2 * np.sin(run.t) + 0.3 * np.sign(np.cos(run.t)), abs=1e-9)
     assert sv.verify(run).passed
@@ -673,12 +704,9 @@ def test_dry_friction_along_a_flat_program():
 @pytest.mark.parametrize("samples", [15, 1001])
 def test_dry_friction_does_not_act_where_a_flat_program_rests(samples):
     """To and fro between rests, at which sign 0 = 0."""
-
-    def path(t):
-        there, back = (sv.paths.rest_to_rest(t, 0.0, 1.0, duration=2.0, t_start=s, smoothness=4) for s in (1.0, 4.0))
-        return there - back
-
-    model = rubbed(path)
+    there = sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, t_start=1.0, smoothness=4)
+    path = there - sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, t_start=4.0, smoothness=4)
+    model = rubbed(lambda q: q.references(X=path).X)
     run = sv.simulate(model, model.start(), (0.0, 7.0), t_eval=np.linspace(0.0, 7.0, samples))
     direction = np.where((run.t > 1) & (run.t < 3), 1.0, np.where((run.t > 4) & (run.t < 6), -1.0, 0.0))
     assert run["u"] - 2 * run["d2x"] == pytest.approx(0.3 * direction, abs=1e-12)

@@ -27,7 +27,7 @@ def test_the_logarithm_of_steps_is_within_a_hundredth():
 def test_a_coefficient_that_vanishes_does_not_lengthen_the_step(order, speed, oscillator):
     """At the turning point of x'' = -x every odd coefficient vanishes, where it passes zero every even one."""
     f, x0 = series_loop(oscillator, order + 1), oscillator.start(x=1.0 - speed, dx=speed).values
-    log = f.taylor(0.0, x0, 10.0, np.append(oscillator.parameters, 5.0), 1e-8, 1e-8, 10_000)
+    log = f.taylor(0.0, x0, 10.0, np.append(oscillator.p, 5.0), 1e-8, 1e-8, 10_000)
     t, x = log[:, 0], log[:, 1]
     assert t[-1] == 10.0 and np.abs(x - (np.cos(t) * (1.0 - speed) + np.sin(t) * speed)).max() < 1e-6
     assert t[1] < 1.3 * np.diff(t)[1:-1].max()
@@ -286,7 +286,7 @@ def test_matrices_have_the_velocities_that_rows_determine(span):
     speed = lambda t, _: [2 / np.sqrt(1 + np.sin(0.4 * np.cos(t - span[0]) + t) ** 2)]  # noqa: E731
     exact = solve_ivp(speed, span, [0.0], rtol=1e-11, atol=1e-12)
     assert run["x"][-1] == pytest.approx(exact.y[0, -1], abs=1e-8)
-    f, p, state = series_loop(model, 8), np.append(model.parameters, 3.0), start.values
+    f, p, state = series_loop(model, 8), np.append(model.p, 3.0), start.values
     assert f.others, "no velocity is determined by rows"
     moved = state.copy()
     moved[f.sizes["nq"] :] += 0.1 * (1 - np.array(f.sizes["free"]))
@@ -332,14 +332,14 @@ def test_one_call_over_many_knots_has_the_bits_of_a_call_for_each_piece(forward,
     bob = (x + ca.sin(theta), -ca.cos(theta))
     gibbs = sv.particle(q, 2.0, (x, 0.0)) + sv.particle(q, 0.5, bob)
     machine = sv.Mechanism(q, gibbs=gibbs, potential=4.9 * bob[1], actuators={"F": x})
-    knots = np.linspace(0.0, 6.0, 60 if natural else 300)  # coefficients in sums, and in tables
-    path = sv.paths.spline(q.t, knots, np.sin(knots), 3, "natural" if natural else "rest")
-    model = sv.derive(machine, sv.Program({"X": x - path}, by="actuators"))
+    knots = np.linspace(0.0, 6.0, 60 if natural else 300)
+    path = sv.paths.spline(knots, np.sin(knots), smoothness=3, ends="natural" if natural else "rest")
+    model = sv.derive(machine, sv.Program({"X": x - q.references(X=path).X}, by="actuators"))
     ends = knots[(knots > 1.0) & (knots < 4.0)].tolist()
     ends = [*ends, 4.0] if forward else [*ends[::-1], 1.0]
     t = first = 1.0 if forward else 4.0
     start, f, top = model.start(t=first, theta=0.1, dtheta=0.0).values, series_loop(model, 11), model.reduction.top
-    p, state, rows = np.append(model.parameters, np.nan), start, []
+    p, state, rows = np.append(model.p, np.nan), start, []
     for end in ends:
         piece = f.taylor(t, state, end, p, 1e-8, 1e-9, 100)
         rows, t, state = [*rows, *piece[:-1]], end, piece[-1, 1 : 1 + start.size]
@@ -364,7 +364,7 @@ def test_a_robot_that_turns_at_measured_rates_has_their_integral(samples, span, 
     (x, y, theta), (dx, dy, dtheta) = q, q.d(1)
     times = np.linspace(0.0, 6.0, samples)
     rates = 0.4 * np.sin(2.0 * times) + 0.2
-    turn = sv.paths.spline(q.t, times, rates, 3, "natural")
+    turn = q.references(turn=sv.paths.spline(times, rates, smoothness=3, ends="natural")).turn
     S = sv.particle(q, 2.0, (x, y)) + 0.3 * q.d(2)[2] ** 2 / 2
     wheel = {"wheel": dy * ca.cos(theta) - dx * ca.sin(theta)}
     program = {"speed": dx * ca.cos(theta) + dy * ca.sin(theta) - 1.0, "turn": dtheta - turn}

@@ -67,7 +67,7 @@ def test_a_limit_at_zero_is_a_limit():
     q = sv.coordinates("z")
     (z,) = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 3.0, z), potential=3.0 * 9.81 * z, actuators={"rope": z})
-    program = sv.Program({"Z": z - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=3)})
+    program = sv.Program({"Z": z - q.references(Z=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=3)).Z})
     law = sv.fastest(mechanism, program, {"rope": (0.0, None)}, (0.0, 2.0))
     model = sv.derive(mechanism, program)
     (_, least), _ = sv.simulate(model, model.start(), (0.0, 2.0)).extrema("d2z")

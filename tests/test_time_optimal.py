@@ -48,11 +48,11 @@ def mass(path, m=2.0):
     (x,) = q
     p = sv.parameters(m=m)
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, p.m, x), actuators={"push": x}, parameters=p)
-    return mechanism, sv.Program({"X": x - path(q.t)})
+    return mechanism, sv.Program({"X": x - path(q)})
 
 
-def S7(t):
-    return sv.paths.rest_to_rest(t, 0.0, 3.0, duration=5.0, smoothness=3)
+def S7(q):
+    return q.references(X=sv.paths.rest_to_rest(0.0, 3.0, duration=5.0, smoothness=3)).X
 
 
 def trailer():
@@ -63,7 +63,7 @@ def trailer():
     mechanism = sv.Mechanism(
         q, gibbs=sv.particle(q, 10.0, x) + sv.particle(q, 5.0, y), forces={"x": pull, "y": -pull}, actuators={"push": x}
     )
-    return mechanism, sv.Program({"X": x - S7(q.t)})
+    return mechanism, sv.Program({"X": x - S7(q)})
 
 
 def test_the_crane_is_faster_than_by_any_polynomial_and_at_a_limit_nearly_throughout():
@@ -80,7 +80,7 @@ def test_the_crane_is_faster_than_by_any_polynomial_and_at_a_limit_nearly_throug
     assert law.plan["X"][-1] == pytest.approx(5.0) and abs(law.plan["trolley"][-1]) < 1e-6
 
 
-@pytest.mark.parametrize("path, span", [(S7, (0.0, 5.0)), (lambda t: 0.06 * t, (0.0, 50.0))])
+@pytest.mark.parametrize("path, span", [(S7, (0.0, 5.0)), (lambda q: 0.06 * q.t, (0.0, 50.0))])
 def test_a_mass_takes_the_time_of_full_thrust_and_one_interval_of_ramps(path, span):
     """Thrust ±F takes 2√(dm/F); reversal and both ends take an interval each, whatever the pace of the path given."""
     law = sv.fastest(*mass(path), {"push": 4.0}, span, shape=True)
@@ -125,7 +125,7 @@ def test_a_full_circle_is_followed():
     q = sv.coordinates("x y")
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), actuators={"fx": x, "fy": y})
-    turn = 2 * np.pi * sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
+    turn = 2 * np.pi * q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)).s
     program = sv.Program({"X": x - ca.cos(turn), "Y": y - ca.sin(turn)})
     law = sv.fastest(mechanism, program, {"fx": 3.0, "fy": 3.0}, (0.0, 2.0), shape=True)
     assert np.abs(np.hypot(law.plan["x"], law.plan["y"]) - 1.0).max() < 1e-11
@@ -134,17 +134,17 @@ def test_a_full_circle_is_followed():
 
 
 def test_what_is_no_curve_is_refused():
-    def line(t):
-        return sv.paths.rest_to_rest(t, 0.0, 1.0, duration=2.0)
+    def line(q, name="X"):
+        return q.references(**{name: sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)})[name]
 
-    def there_and_back(t):
-        return ca.sin(np.pi * line(t))
+    def there_and_back(q):
+        return ca.sin(np.pi * line(q))
 
     pushed, wanted = mass(line), {"push": 3.0}
     q = pushed[0].q
     (x,), t = q, q.t
     for program, name in (
-        (sv.Program({"X": x * (1.0 + t) - line(t)}), "X"),
+        (sv.Program({"X": x * (1.0 + t) - line(q, "Y")}), "X"),
         (sv.Program({"X": x - 1.0}), "X"),
         (sv.Program({"X": q.d(1)[0] - t}), "X"),
     ):
@@ -170,7 +170,7 @@ def test_limits_without_a_time_law_are_refused():
     x, y = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, ca.vertcat(x, y)), actuators={"fx": x, "fy": y})
     with refused(sv.errors.SpecificationError, factor=2.0**-12):
-        sv.fastest(mechanism, sv.Program({"X": x - S7(q.t), "Y": y}), {"fy": 3.0}, (0.0, 5.0), shape=True)
+        sv.fastest(mechanism, sv.Program({"X": x - S7(q), "Y": y}), {"fy": 3.0}, (0.0, 5.0), shape=True)
 
 
 def test_unstable_internal_dynamics_are_refused():

@@ -80,7 +80,7 @@ def test_a_model_that_travelled_takes_other_numbers_and_other_pivots(crane):
     for change in (lambda m: m.with_parameters(m_load=50.0), lambda m: derived_near(m, t, jets)):
         here, far = change(model), change(again(model))
         assert here == far
-        values = [m.signals("actuation")[1](t, jets, m.parameters) for m in (here, far)]
+        values = [m.signals("actuation")[1](t, jets, m.p) for m in (here, far)]
         assert np.array_equal(*values)
 
 

@@ -65,7 +65,7 @@ def test_the_accelerations_of_a_robot_are_those_of_its_full_mass_matrix():
         state = np.random.default_rng(seed).uniform(-1.0, 1.0, len(model.state_names))
         matrix, right = (np.array(part) for part in form(0.3, state, model.parameters))
         expected = np.linalg.solve(matrix, right)[:, 0]
-        y = model.function("accelerations")(0.3, state, model.parameters)
+        y = model.function("accelerations")(0.3, state, model.p)
         assert y == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 

@@ -38,7 +38,7 @@ def crane(moving, c=5.0):
     x, l, theta = q
     load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
     S = sv.particle(q, 10.0, x) + sv.particle(q, 5.0, l) + sv.particle(q, 100.0, load)
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, 6.0, smoothness=4)
+    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, 6.0, smoothness=4)).s
     X, Z = (2 * ca.sin(q.t), 3.0) if moving else (5 * s, 4 - 2 * s)
     mechanism = sv.Mechanism(
         q, S, potential=-100.0 * G * load[1], forces={"theta": -c * q.d(1)[2]}, actuators={"trolley": x, "hoist": l}
@@ -179,7 +179,7 @@ def test_limits_of_a_robots_file(angle, effort, said):
     robot = sv.urdf(ARM.format(effort=effort))
     mechanism = robot.mechanism()
     q = mechanism.q
-    program = sv.Program({"hip": q["hip"] - sv.paths.rest_to_rest(q.t, 0.0, angle, 3.0)}, by="actuators")
+    program = sv.Program({"hip": q["hip"] - q.references(hip=sv.paths.rest_to_rest(0.0, angle, 3.0)).hip}, by="actuators")
     told = remarks(sv.derive(mechanism, program))
     assert [one.startswith(said) and "beyond its limit of" in one for one in told] == [True] * bool(said)
 
@@ -252,7 +252,7 @@ def test_a_loop_with_few_samples_in_the_fastest_time_constant(stiffness, said):
     x, y = q
     S = sv.particle(q, 4.0, x) + sv.particle(q, 4.0, y)
     mechanism = sv.Mechanism(q, S, potential=stiffness * (y - x) ** 2 / 2, actuators={"F": x, "G": y})
-    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0), "Y": y - x})
+    program = sv.Program({"X": x - q.references(X=sv.paths.rest_to_rest(0.0, 1.0, 2.0)).X, "Y": y - x})
     model, plant = sv.derive(mechanism, program), sv.plant(mechanism)
     plan = sv.simulate(model, model.start(), (0.0, 2.0))
     closed = sv.close(plant, sv.lqr(plan, plant, 100.0), plan.state(0.0), (0.0, 2.0))

@@ -17,6 +17,14 @@ from servoctl.model import store
 
 pytestmark = pytest.mark.filterwarnings("ignore:No C compiler")
 T, X, Y = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("y")
+
+
+def late(start, power):
+    """The path that is zero before an instant and a power of the time since afterwards."""
+    table = np.column_stack([np.zeros(power + 1), np.eye(power + 1, 1)])
+    return sv.paths.polynomials([start - 1.0, start, start + 1.0], table, before="hold", after="continue")
+
+
 BLENDS = {  # of (t, x): zero, or below rounding, at first
     "fmax in time": lambda t, x: 0.5 * ca.fmax(0, t - 4) ** 5 * x,
     "tanh in time": lambda t, x: 0.25 * (1 + ca.tanh(40 * (t - 3))) * x,
@@ -235,13 +243,20 @@ def test_a_memoised_derivation_keeps_what_its_orders_rest_on(monkeypatch, tmp_pa
 # other instants and places --------------------------------------------------------------------------------------------
 
 
-def blended(blend):
-    """Three unit masses beside a 2 s path, y = blend(t, x): the model, and (x, dx)' of the one free coordinate."""
+FOLLOWED = {"fmax in time": lambda q, x: 0.5 * q.references(late=late(4.0, 5)).late * x}
+
+
+def blended(blend, followed=None):
+    """Three unit masses beside a 2 s path, y = blend(t, x): the model, and (x, dx)' of the one free coordinate.
+
+    Where the blend switches in time, `followed` has it of (q, x) for the model, along a path.
+    """
     q = sv.coordinates("x y z")
     x, y, z = q
     mechanism = sv.Mechanism(q, gibbs=sum(a**2 for a in q.d(2)) / 2, potential=x**2 / 2 + y)
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
-    model = sv.derive(mechanism, sv.Program({"Y": y - blend(q.t, x), "Z": z - path}, by="ideal"))
+    to = q.references(Z=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)).Z
+    place = blend(q.t, x) if followed is None else followed(q, x)
+    model = sv.derive(mechanism, sv.Program({"Y": y - place, "Z": z - to}, by="ideal"))
     v, g = ca.SX.sym("v"), blend(T, X)
     slope, rate = ca.jacobian(g, X), ca.jacobian(g, T)
     drift = ca.jacobian(slope, X) * v**2 + 2 * ca.jacobian(slope, T) * v + ca.jacobian(rate, T)
@@ -266,7 +281,7 @@ def moved(f, span, start):
 @functools.cache
 def scene(name):
     """A model, its span, the start and the end of its motion."""
-    model, f = blended({**BLENDS, **FLAT}[name])
+    model, f = blended({**BLENDS, **FLAT}[name], FOLLOWED.get(name))
     start = (1.0, 0.0) if "place" not in name and "dwell" not in name else (1.0, 6.0 if "bump" in name else 3.5)
     span = (0.0, 42.0 if "far" in name else 5.0)
     return model, span, start, moved(f, span, start)
@@ -311,18 +326,20 @@ def test_a_bump_while_the_motion_rests_is_not_stepped_over(method):
     assert abs(end[0]) > 1e-3 and abs(run["x"][-1] - end[0]) < 1e-8
 
 
-@pytest.mark.parametrize("blend", [lambda t: ca.fmax(0, t - 3) ** 5, lambda t: (1 + ca.tanh(40 * (t - 3))) / 2])
-def test_a_force_that_turns_drives_what_it_turns_to(blend):
+TANH = (lambda q: (1 + ca.tanh(40 * (q.t - 3))) / 2, lambda t: (1 + np.tanh(40 * (t - 3))) / 2)
+
+
+@pytest.mark.parametrize(("blend", "turn"), [(lambda q: q.references(late=late(3.0, 5)).late, late(3.0, 5)), TANH])
+def test_a_force_that_turns_drives_what_it_turns_to(blend, turn):
     q = sv.coordinates("x y z")
     x, y, z = q
     mechanism = sv.Mechanism(
         q, gibbs=sum(a**2 for a in q.d(2)) / 2, potential=(x**2 + z**2) / 2 + y**2,
-        actuators={"F": ca.vertcat(1, 0.4 * blend(q.t), 0), "G": z},
+        actuators={"F": ca.vertcat(1, 0.4 * blend(q), 0), "G": z},
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
+    path = q.references(Z=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)).Z
     model = sv.derive(mechanism, sv.Program({"X": x - ca.sin(2 * q.t), "Z": z - path}, by="actuators"))
     run = sv.simulate(model, model.start(y=0.5, dy=0.0), (0.0, 4.0))
-    turn = ca.Function("turn", [T], [blend(T)])
     reference = solve_ivp(
         lambda t, s: [s[1], -2 * s[0] - 1.2 * float(turn(t)) * np.sin(2 * t)], (0.0, 4.0), [0.5, 0.0],
         rtol=1e-10, atol=1e-12, max_step=0.02,
@@ -335,8 +352,8 @@ def coupled(kind, blend):
     """Two masses and a spring, the second on a path of 2 s, with what ties them closer from some instant on."""
     q = sv.coordinates("a b")
     (a, b), (da, db), (d2a, d2b) = q, q.d(1), q.d(2)
-    s, inertia = 0.3 * blend(q.t), d2a**2 / 2 + d2b**2
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=5) + 0.3 * ca.sin(q.t)
+    s, inertia = 0.3 * blend(q), d2a**2 / 2 + d2b**2
+    path = q.references(P=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=5)).P + 0.3 * ca.sin(q.t)
     spring, program = {"potential": 2.5 * (a - b) ** 2}, sv.Program({"P": b - path}, by="actuators")
     match kind:
         case "force":
@@ -353,9 +370,8 @@ ORDERS = {"force": (0, 2), "mass": (0, 2), "damper": (0, 1), "residual": (2, 3)}
 
 
 @pytest.mark.parametrize("kind", ORDERS)
-@pytest.mark.parametrize("blend", [lambda t: ca.fmax(0, t - 3) ** 7, lambda t: (1 + ca.tanh(40 * (t - 3))) / 2])
-def test_a_motion_ends_where_a_row_takes_another_order(kind, blend):
-    model = sv.derive(*coupled(kind, blend))
+def test_a_motion_ends_where_a_row_takes_another_order(kind):
+    model = sv.derive(*coupled(kind, TANH[0]))
     before, after = ORDERS[kind]
     assert model.free == before
     start = model.start(guess={"a": 0.0, "da": 0.0})
@@ -364,6 +380,16 @@ def test_a_motion_ends_where_a_row_takes_another_order(kind, blend):
     run, t = caught.value.run, caught.value.details["t"]
     assert 2.7 < t < 3.4 and not run.success and run.t[-1] == pytest.approx(t, abs=0.005)
     assert sv.simulate(model, start, (0.0, 2.5)).success
+
+
+@pytest.mark.parametrize("kind", ORDERS)
+def test_no_motion_starts_where_a_path_that_is_zero_takes_a_row_its_order(kind):
+    """Orders are those of any value of a path; where it vanishes the program is singular."""
+    model = sv.derive(*coupled(kind, lambda q: q.references(late=late(3.0, 7)).late))
+    assert model.free == ORDERS[kind][1]
+    why = "gradient of row 'P' vanishes" if kind == "residual" else "relative degrees differ"
+    with refused(SingularProgram, why, t=0.0):
+        sv.simulate(model, model.start(guess={"a": 0.0, "da": 0.0}), (0.0, 4.0))
 
 
 def test_a_motion_ends_where_a_residual_begins_to_hold_velocities():
@@ -383,8 +409,9 @@ def test_a_row_that_becomes_nonlinear_in_its_highest_derivative_is_solved_as_suc
     q = sv.coordinates("x y")
     (x, y), (d2x, d2y) = q, q.d(2)
     mechanism = sv.Mechanism(q, gibbs=(d2x**2 + d2y**2) / 2, potential=x**2 / 2)
-    first = 0.1 * ca.fmin(ca.fmax(0, q.t - 1), 1)  # points are drawn between 1 and 2 s
-    residual = d2y + y - 0.1 * ca.fmax(0, q.t - 4) ** 5 * d2y**2 - first**7
+    ramp = sv.paths.polynomials([0.0, 1.0, 2.0, 5.0], [[0.0, 0.1, 0.0], [0.0, 0.0, 0.1]])
+    r = q.references(ramp=ramp, late=late(4.0, 5))
+    residual = d2y + y - 0.1 * r.late * d2y**2 - r.ramp**7
     model = sv.derive(mechanism, sv.Program({"Y": residual}, by="ideal"), keep=["x"])
     start = model.start(x=1.0, dx=0.0, y=0.1, dy=0.0, guess={"d2y": -0.1, "d2x": -1.0})
     run = sv.simulate(model, start, (0.0, 5.0))
@@ -436,7 +463,7 @@ def test_a_flat_plan_presses_on_a_spring_stop(numbers):
         q, gibbs=(p.m * d2a**2 + p.M * d2b**2) / 2, parameters=p, actuators={"F": a},
         potential=p.c * (a - b) ** 2 / 2 + p.k * ca.fmax(0, b - 0.5) ** 7,
     )  # fmt: skip
-    path = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0, smoothness=5)
+    path = q.references(P=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0, smoothness=5)).P
     model = sv.derive(mechanism, sv.Program({"P": b - path}, by="actuators")).with_parameters(**numbers)
     run = sv.simulate(model, model.start(), (0.0, 2.0))
     assert sv.verify(run).passed

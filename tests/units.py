@@ -36,6 +36,10 @@ def in_units(mechanism, program, units, length=1.0, mass=1.0, time=1.0):
         inner += [s / scale * (1.0 if old.plain else time**0) for s, scale in zip(new.gamma(k), scales, strict=True)]
     if not old.plain:  # w in length per time
         inner = inner[: 1 + old.nq] + [s * time for s in inner[1 + old.nq :]]
+    references = new.references(**{name: path.at_rate(1 / time, about=0.0) for name, path in old.family.paths.items()})
+    for k in range(12):
+        outer += [old.family.jet(name, k) for name in references.names]
+        inner += [jet * time**k for jet in references.d(k)]
 
     def change(expression):
         return ca.substitute(ca.SX(expression), ca.vertcat(*outer), ca.vertcat(*inner))

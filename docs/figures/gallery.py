@@ -128,7 +128,8 @@ def _how(scene, names):
     """The time span; the bounded motion, up to the end of the path, where the internal dynamics are unstable."""
     if verdict(names["model"], names["start"]).dynamics != HYPERBOLIC_ZEROS:
         return scene.t_span
-    return f'{(scene.t_span[0], max(scene.t_span[1], *names["model"].knots))}, "bounded"'
+    ends = (path.breaks[-1] for path in names["model"].paths.values())
+    return f'{(scene.t_span[0], max(scene.t_span[1], *map(float, ends)))}, "bounded"'
 
 
 def code(scene):

@@ -23,7 +23,6 @@ from servoctl.growth import internal_dynamics
 from servoctl.jets.tape import Tape, evaluate
 from servoctl.methods.stability import sampled_bound
 from servoctl.plants.plant import Plant
-from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
 from servoctl.reduction.realisation import desired_actuation
 from servoctl.run import Run
@@ -429,8 +428,6 @@ def _require_smooth(plan, orders):
     for name, residual in reduction.program.residuals.items():
         for reference, k in Jets(q, [residual]).places:
             _require_class(plan, name, orders.get(name, 0) + k, reference)
-    if reduction.timed and any(order > reduction.needs.get(name, 0) for name, order in orders.items()):
-        require_smooth(reduction.switches, plan.model.parameters, orders, (plan.t[0], plan.t[-1]))
 
 
 def _require_class(plan, name, order, reference):

@@ -27,7 +27,7 @@ from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.paths import rest_to_rest
 from servoctl.spec.program import Program
-from servoctl.spec.references import followed_path, orders_in, required_paths
+from servoctl.spec.references import followed_path, orders_in, paths_at, required_paths
 from servoctl.values import frozen
 
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
@@ -98,7 +98,7 @@ def fastest(
     mechanism : Mechanism
     program : Program
         With `shape=True` its residuals are h(q) - p(t), or conditions that hold at any speed; they may follow the curve
-        p at any pace, such as `paths.line(q.t, ...)`.
+        p at any pace, such as `curves.line(q.t, ...)`.
     limits : dict of str to (float, float) or float
         Lower and upper limit of actuators, their rates ("dtrolley") and outputs by name; a number c is (-c, c), None
         leaves a side open.
@@ -153,7 +153,7 @@ def fastest_along(paths, mechanism, program, limits, t_span, options):
         {name: finite(name, value, "start value") for name, value in mapping(start, "The start values").items()},
         guess,
         mapping(parameters, "The parameters"),
-        paths_of(mechanism.q, program, paths),
+        paths_of(mechanism, program, paths, mapping(parameters, "The parameters")),
     )
     with progress_bar("fastest", None, unit=" motions") as bar:
         return _optimal(scene, bar) if require_kind(bool, "shape", shape, "shape=True") else _even(scene, bar)
@@ -229,11 +229,13 @@ def _optimal(scene, bar):
     )
 
 
-def paths_of(q, program, given):
-    """The paths of a program's references by name, some of which may be given."""
+def paths_of(mechanism, program, given, parameters):
+    """The paths of a program's references by name, some of which may be given, with parameters by name."""
+    q, known = mechanism.q, mechanism.parameters
     paths = {name: q.family.paths[name] for name in program.references(q)}
     changes = by_name(mapping(given, "The paths"), paths, "reference", "The references")
-    return required_paths(paths | {name: followed_path(name, path) for name, path in changes.items()})
+    paths = required_paths(paths | {name: followed_path(name, path) for name, path in changes.items()})
+    return paths_at(paths, known, known.values(parameters))
 
 
 @frozen

@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.codegen.paths import RULES, jets_in
 from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, text_of
-from servoctl.spec.references import required_paths
+from servoctl.spec.references import require_fixed, required_paths
 from servoctl.values import frozen
 
 OPEN = 3  # the rule of an end of a path outside of which nothing is said, after the numbers of `RULES`
@@ -55,6 +55,8 @@ def _without_place(f, argument):
 
 def _tables(model, count, real):
     """C text of the paths that a model follows, of which `count` derivatives are needed, and its macros."""
+    parameters = model.reduction.mechanism.parameters
+    require_fixed(model.paths, parameters, parameters.names, "A table in C leaves it to the caller to change")
     texts, rows = [], []
     for i, (name, path) in enumerate(required_paths(model.paths).items()):
         _require_ascending(name, path, real)

@@ -45,7 +45,8 @@ def vtol(point="flat"):
 
     height = 0 if point == "centre" else p.J * ca.sin(p.tilt) / (p.M * arm)
     followed = ca.vertcat(x, z) + height * along
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 0.0), end=(5.0, 2.0), duration=4.0, smoothness=4)
+    path = sv.paths.rest_to_rest(start=(0.0, 0.0), end=(5.0, 2.0), duration=4.0, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.rigid_body(q, p.M, (0, 0, p.J), position=(x, z), rates=(0, 0, q.d(1)[2])),
@@ -64,7 +65,7 @@ def vtol(point="flat"):
         },
         parameters=p,
     )
-    return mechanism, sv.Program({"X": followed[0] - path[0], "Z": followed[1] - path[1]}, by="actuators")
+    return mechanism, sv.Program({"X": followed[0] - r.X, "Z": followed[1] - r.Z}, by="actuators")
 
 
 def _thruster(tip, along, across, tilt):

@@ -35,7 +35,8 @@ def reaction_wheels(turn=120.0, duration=20.0):
     momentum = ca.vertcat(p.J1, p.J2, p.J3) * w + p.J_w * s  # N m s, along the body's axes
     S = ca.dot(dw, ca.vertcat(p.J1, p.J2, p.J3) * dw) / 2 + p.J_w * ca.dot(ds, ds / 2 + dw)
     S += ca.dot(dw, ca.cross(w, momentum))  # (3.11) of the satellite and its wheels
-    turned = sv.paths.rest_to_rest(q.t, 0.0, turn * ca.pi / 180, duration=duration, smoothness=2)
+    path = sv.paths.rest_to_rest(0.0, turn * ca.pi / 180, duration=duration, smoothness=2)
+    r = q.references(turn=path)
     axes = attitude(e)
     axles = ca.horzsplit(axes)
     mechanism = sv.Mechanism(
@@ -51,7 +52,7 @@ def reaction_wheels(turn=120.0, duration=20.0):
         units=dict.fromkeys(q.velocity_names, "rad/s"),
         parameters=p,
     )
-    residuals = sv.programs.orientation("turn", axes, sv.rotations.turn(turned, AXIS))
+    residuals = sv.programs.orientation("turn", axes, sv.rotations.turn(r.turn, AXIS))
     return mechanism, sv.Program(residuals, by="actuators")
 
 

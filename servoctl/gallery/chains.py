@@ -30,7 +30,7 @@ def four_bar():
     pin, joint, end = tips
     across = ca.vertcat(pin[1] - joint[1], joint[0] - pin[0])
     traced = (pin + joint) / 2 + across / 2
-    turn = sv.paths.rest_to_rest(q.t, 0.0, 2 * ca.pi, duration=3.0, smoothness=3)
+    r = q.references(turn=sv.paths.rest_to_rest(0.0, 2 * ca.pi, duration=3.0, smoothness=3))
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
@@ -49,7 +49,7 @@ def four_bar():
         },
         parameters=p,
     )
-    return mechanism, sv.Program({"turn": q["crank"] - turn}, by="actuators")
+    return mechanism, sv.Program({"turn": q["crank"] - r.turn}, by="actuators")
 
 
 def cable_robot(pretension=500.0):
@@ -79,7 +79,8 @@ def cable_robot(pretension=500.0):
         corner = ca.vertcat(2.0 * front, 1.5 * side, 1.5 * up)
         fixed = ca.vertcat(0.4 * front * up, 0.3 * side, -0.15 * up)  # the upper ropes cross the lower ones
         ropes[f"rope{i}"] = [corner, centre + turned @ fixed]
-    motion = sv.paths.rest_to_rest(q.t, (0.0,) * 6, (0.3, 0.2, 0.3, 0.0, 0.0, 0.1), duration=3.0, smoothness=2)
+    path = sv.paths.rest_to_rest((0.0,) * 6, (0.3, 0.2, 0.3, 0.0, 0.0, 0.1), duration=3.0, smoothness=2)
+    r = q.references(**{name: path[i] for i, name in enumerate(q.names)})
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.rigid_body(q, p.m, (p.Jx, p.Jy, p.Jz), position=centre, rotation=turned),
@@ -89,5 +90,5 @@ def cable_robot(pretension=500.0):
         shapes=ropes | {"platform": [ropes[f"rope{i}"][1] for i in (5, 6, 8, 7, 5)], "centre": [centre]},
         parameters=p,
     )
-    residuals = {name: q[name] - motion[i] for i, name in enumerate(q.names)}
+    residuals = {name: q[name] - r[name] for name in q.names}
     return mechanism, sv.Program(residuals, toward=dict.fromkeys(ropes, pretension), by="actuators")

@@ -45,9 +45,10 @@ def overhead_crane(duration=6.0, coordinates="relative"):
         x, l, X, Z = q
         hung = _roped(ca.vertcat(x, 0), l, ca.vertcat(X, Z))
     machine = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l)
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 4.0), end=(5.0, 2.0), duration=duration, smoothness=4)
+    path = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(5.0, 2.0), duration=duration, smoothness=4)
+    target = ca.vertcat(*q.references(X=path[0], Z=path[1]))
     shapes = _plane_shapes(x, hung[0], (-0.5, 5.5))
-    return _following(q, p, machine, hung, {"trolley": x, "hoist": l}, path, shapes)
+    return _following(q, p, machine, hung, {"trolley": x, "hoist": l}, target, shapes)
 
 
 def winch_crane(coordinates="relative"):
@@ -79,9 +80,10 @@ def winch_crane(coordinates="relative"):
         x, beta, X, Z = q
         hung = _roped(ca.vertcat(x, 0), p.r * beta, ca.vertcat(X, Z))
     machine = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.J, beta)
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, 4.0), end=(1.0, 5.0), duration=6.0, smoothness=6)
+    path = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(1.0, 5.0), duration=6.0, smoothness=6)
+    target = ca.vertcat(*q.references(X=path[0], Z=path[1]))
     shapes = {"drum": sv.shapes.disc((x, 0), 2 * p.r, beta)} | _plane_shapes(x, hung[0], (-1.5, 2.5))
-    return _following(q, p, machine, hung, {"trolley": x, "winch": beta}, path, shapes)
+    return _following(q, p, machine, hung, {"trolley": x, "winch": beta}, target, shapes)
 
 
 def crane_3d(coordinates="relative"):
@@ -115,9 +117,9 @@ def crane_3d(coordinates="relative"):
         x, y, l, X, Y, Z = q
         hung = _roped(ca.vertcat(x, y, 0), l, ca.vertcat(X, Y, Z))
     machine = sv.particle(q, p.m_bridge, x) + sv.particle(q, p.m_trolley, y) + sv.particle(q, p.m_hoist, l)
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=6.0, smoothness=6)
-    turn = sv.paths.circle(pi / 2 * (s - 1), centre=(0.0, 3.0), radius=3.0)
-    path = ca.vertcat(turn, sv.paths.line(s, 5.0, 3.0))
+    (s,) = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=6.0, smoothness=6))
+    turn = sv.curves.circle(pi / 2 * (s - 1), centre=(0.0, 3.0), radius=3.0)
+    target = ca.vertcat(turn, sv.curves.line(s, 5.0, 3.0))
     (X, Y, Z), low, high = ca.vertsplit(hung[0]), -0.5, 3.5
     shapes = {
         "left rail": [(low, low, 0), (high, low, 0)],
@@ -127,7 +129,7 @@ def crane_3d(coordinates="relative"):
         "rope": [(x, y, 0), (X, Y, -Z)],
         "load": [(X, Y, -Z)],
     }
-    return _following(q, p, machine, hung, {"bridge": x, "trolley": y, "hoist": l}, path, shapes)
+    return _following(q, p, machine, hung, {"bridge": x, "trolley": y, "hoist": l}, target, shapes)
 
 
 def _relative(coordinates):
@@ -158,8 +160,8 @@ def _plane_shapes(x, load, rail):
     }
 
 
-def _following(q, p, machine, hung, actuators, path, shapes):
-    """The crane whose load, as `_hanging` or `_roped` give it, follows a path; the last axis points down."""
+def _following(q, p, machine, hung, actuators, target, shapes):
+    """The crane whose load, as `_hanging` or `_roped` give it, follows a target; the last axis points down."""
     load, rope, constraints = hung
     weight = p.m_load * p.g
     tension = weight * rope[-1] - p.m_load * ca.dot(q.dt(load, 2), rope)  # N, of m (g e - a) along the rope
@@ -176,4 +178,4 @@ def _following(q, p, machine, hung, actuators, path, shapes):
         shapes=shapes,
         parameters=p,
     )
-    return mechanism, sv.Program({name: load[i] - path[i] for i, name in enumerate(axes)}, by="actuators")
+    return mechanism, sv.Program({name: load[i] - target[i] for i, name in enumerate(axes)}, by="actuators")

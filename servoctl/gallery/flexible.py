@@ -28,7 +28,7 @@ def flexible_joint(friction=2.0):
     q = sv.coordinates("link motor", units="rad rad")  # from the horizontal, behind the gear
     link, motor = q
     rubbing = ca.tanh(ca.vertcat(*q.d(1)) / 0.1)
-    path = sv.paths.rest_to_rest(q.t, -ca.pi / 2, 0.0, duration=1.0, smoothness=4)
+    r = q.references(angle=sv.paths.rest_to_rest(-ca.pi / 2, 0.0, duration=1.0, smoothness=4))
     end, hand = (ca.vertcat(ca.cos(angle), ca.sin(angle)) for angle in (link, motor))
     mechanism = sv.Mechanism(
         q,
@@ -44,7 +44,7 @@ def flexible_joint(friction=2.0):
         },
         parameters=p,
     )
-    return mechanism, sv.Program({"angle": link - path}, by="actuators")
+    return mechanism, sv.Program({"angle": link - r.angle}, by="actuators")
 
 
 def elastic_link(n=4):
@@ -81,7 +81,7 @@ def elastic_link(n=4):
         joints.append(joints[-1] + length * ca.vertcat(ca.cos(angle), ca.sin(angle)))
         middle = (joints[-1] + joints[-2]) / 2
         S += sv.rigid_body(q, mass, (0, 0, mass * length**2 / 12), position=middle, rates=(0, 0, q.dt(angle)))
-    path = sv.paths.rest_to_rest(q.t, 0.0, ca.pi / 2, duration=1.0, smoothness=2)
+    r = q.references(angle=sv.paths.rest_to_rest(0.0, ca.pi / 2, duration=1.0, smoothness=2))
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
@@ -93,4 +93,4 @@ def elastic_link(n=4):
         shapes={"hub": sv.shapes.disc((0, 0), 0.08, hub), "link": joints, "tip": [joints[-1]]},
         parameters=p,
     )
-    return mechanism, sv.Program({"angle": hub - path}, by="actuators")
+    return mechanism, sv.Program({"angle": hub - r.angle}, by="actuators")

@@ -24,10 +24,9 @@ def hopper():
     S = sv.rigid_body(q, p.m, (0, 0, p.J), position=centre, rates=(0, 0, q.d(1)[2]))
     S += sum(sv.particle(q, m, end) for m, end in zip(masses, ends, strict=True))
     height = p.m * z + sum(m * end[1] for m, end in zip(masses, ends, strict=True))
-    swings = zip(limbs, HANGING.items(), (1.2, 0.6, 0.6), strict=True)
-    program = {
-        name: limb - sv.paths.rest_to_rest(q.t, start, start + by, duration=0.5) for limb, (name, start), by in swings
-    }
+    swings = zip(HANGING.items(), (1.2, 0.6, 0.6), strict=True)
+    paths = {name: sv.paths.rest_to_rest(start, start + by, duration=0.5) for (name, start), by in swings}
+    r = q.references(**paths)
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
@@ -41,4 +40,4 @@ def hopper():
         },
         parameters=p,
     )
-    return mechanism, sv.Program(program, by="actuators")
+    return mechanism, sv.Program({name: q[name] - r[name] for name in paths}, by="actuators")

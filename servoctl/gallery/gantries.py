@@ -22,7 +22,7 @@ def rotary_crane():
     trolley = r * ca.vertcat(ca.cos(psi), ca.sin(psi), 0)
     rope = ca.vertcat(ca.sin(theta), ca.cos(theta) * ca.sin(phi), ca.cos(theta) * ca.cos(phi))
     load = trolley + l * rope
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=8.0, smoothness=6)
+    (s,) = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=8.0, smoothness=6))
     path = ca.vertcat((3 + s) * ca.cos(pi / 2 * s), (3 + s) * ca.sin(pi / 2 * s), 5 - s)
     machine = sv.rigid_body(q, 0.0, (0, 0, p.J), rates=(0, 0, q.d(1)[0])) + sv.particle(q, p.m_hoist, l)
     above = ca.vertcat(load[0], load[1], -load[2])
@@ -63,7 +63,8 @@ def beam_crane():
     ropes = [end - ca.vertcat(x, 0) for end, x in zip(ends, (x1, x2), strict=True)]
     S = sv.rigid_body(q, p.m_beam, (0, 0, p.m_beam * p.b**2 / 3), position=(X, Z), rates=(0, 0, q.d(1)[6]))
     S += sum(sv.particle(q, p.m_trolley, x) for x in (x1, x2)) + sum(sv.particle(q, p.m_hoist, l) for l in (l1, l2))
-    path = sv.paths.rest_to_rest(q.t, start=(1.0, 4.0), end=(5.0, 3.0), duration=6.0, smoothness=4)
+    path = sv.paths.rest_to_rest(start=(1.0, 4.0), end=(5.0, 3.0), duration=6.0, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
     above = [ca.vertcat(end[0], -end[1]) for end in ends]
     mechanism = sv.Mechanism(
         q,
@@ -80,7 +81,7 @@ def beam_crane():
         },
         parameters=p,
     )
-    rows = {"X": X - path[0], "Z": Z - path[1], "level": phi, "apart": x2 - x1 - 2 * p.b}
+    rows = {"X": X - r.X, "Z": Z - r.Z, "level": phi, "apart": x2 - x1 - 2 * p.b}
     return mechanism, sv.Program(rows, by="actuators")
 
 
@@ -122,5 +123,5 @@ def fixed_rope_crane(tool=5.0):
         },
         parameters=p,
     )
-    path = sv.paths.rest_to_rest(q.t, 0.0, 2.0, duration=4.0)
-    return mechanism, sv.Program({"tool": end[0] - path}, by="actuators")
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 2.0, duration=4.0))
+    return mechanism, sv.Program({"tool": end[0] - r.X}, by="actuators")

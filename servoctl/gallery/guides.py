@@ -47,7 +47,7 @@ def mass_on_car(alpha=pi / 4, damping=1.0, coordinates="relative"):
         constraints = {"guide": sine * (x_m - x) - cosine * y_m}
     else:
         raise unknown(coordinates, ("relative", "absolute"), "choice of coordinates")
-    path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=3.0, smoothness=6)
+    r = q.references(z=sv.paths.rest_to_rest(0.5, 2.5, duration=3.0, smoothness=6))
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.particle(q, p.m_1, x) + sv.particle(q, p.m_2, mass),
@@ -64,4 +64,4 @@ def mass_on_car(alpha=pi / 4, damping=1.0, coordinates="relative"):
         },
         parameters=p,
     )
-    return mechanism, sv.Program({"z": mass[0] - path}, by="actuators")
+    return mechanism, sv.Program({"z": mass[0] - r.z}, by="actuators")

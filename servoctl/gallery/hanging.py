@@ -19,7 +19,7 @@ def double_pendulum():
     x, upper, lower = q
     first = ca.vertcat(x + p.l * ca.sin(upper), -p.l * ca.cos(upper))
     second = first + p.l * ca.vertcat(ca.sin(lower), -ca.cos(lower))
-    path = sv.paths.rest_to_rest(q.t, 0.0, 2.0, duration=4.0, smoothness=2)
+    r = q.references(cart=sv.paths.rest_to_rest(0.0, 2.0, duration=4.0, smoothness=2))
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.particle(q, p.M, x) + sv.particle(q, p.m, first) + sv.particle(q, p.m, second),
@@ -36,4 +36,4 @@ def double_pendulum():
         },
         parameters=p,
     )
-    return mechanism, sv.Program({"cart": x - path}, by="actuators")
+    return mechanism, sv.Program({"cart": x - r.cart}, by="actuators")

@@ -50,8 +50,8 @@ def trailers(radius=2.0, duration=4.0, speed=1.0):
         units={"v": "m/s", "r": "rad/s", "drive": "N"},
         parameters=p,
     )
-    curvature = sv.paths.rest_to_rest(q.t, 0.0, 1 / radius, duration=duration, smoothness=4)
-    residuals = {"curvature": q.dt(kappa - curvature), "speed": v - speed}
+    r = q.references(curvature=sv.paths.rest_to_rest(0.0, 1 / radius, duration=duration, smoothness=4))
+    residuals = {"curvature": q.dt(kappa - r.curvature), "speed": v - speed}
     return mechanism, sv.Program(residuals, by="actuators")
 
 

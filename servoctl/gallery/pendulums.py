@@ -32,7 +32,8 @@ def cart_pole():
         },
         parameters=p,
     )
-    return mechanism, sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)}, by="actuators")
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0))
+    return mechanism, sv.Program({"X": x - r.X}, by="actuators")
 
 
 def furuta_pendulum(damping=0.005):
@@ -63,8 +64,8 @@ def furuta_pendulum(damping=0.005):
         shapes={"arm": [(0, 0, -0.4), (0, 0, 0), end], "rod": [end, bob], "bob": [bob]},
         parameters=p,
     )
-    path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=2.0)
-    return mechanism, sv.Program({"angle": phi - path}, by="actuators")
+    r = q.references(angle=sv.paths.rest_to_rest(0.0, pi / 2, duration=2.0))
+    return mechanism, sv.Program({"angle": phi - r.angle}, by="actuators")
 
 
 def ball_and_beam(tilt=0.05):
@@ -99,7 +100,8 @@ def ball_and_beam(tilt=0.05):
         },
         parameters=p,
     )
-    return mechanism, sv.Program({"tilt": theta - sv.paths.rest_to_rest(q.t, 0.0, -tilt, duration=0.5)}, by="actuators")
+    r = q.references(tilt=sv.paths.rest_to_rest(0.0, -tilt, duration=0.5))
+    return mechanism, sv.Program({"tilt": theta - r.tilt}, by="actuators")
 
 
 def acrobot(gain=-2.0):

@@ -32,8 +32,8 @@ def six_axis_arm(duration=2.0):
     """
     arm = sv.urdf(_description())
     position, rotation = arm.at(HOME, "tool")
-    s = sv.paths.rest_to_rest(arm.q.t, 0.0, 1.0, duration=duration, smoothness=2)
-    path = sv.paths.line(s, position, position + MOVED)
+    (s,) = arm.q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=duration, smoothness=2))
+    path = sv.curves.line(s, position, position + MOVED)
     pose = sv.programs.pose("tool", arm.frame("tool"), path, sv.rotations.turn(TURNED * s, (0, 0, 1), rotation))
     return arm.mechanism(), sv.Program(pose, by="actuators")
 

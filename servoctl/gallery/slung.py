@@ -31,8 +31,9 @@ def slung_load():
         shapes={"body": sv.shapes.box((x, z), 0.8, 0.1, theta), "rope": [(x, z), load], "load": [load]},
         parameters=p,
     )
-    path = sv.paths.rest_to_rest(q.t, start=(0.0, -1.2), end=(4.0, 0.3), duration=4.0, smoothness=6)
-    return mechanism, sv.Program({"across": load[0] - path[0], "up": load[1] - path[1]}, by="actuators")
+    path = sv.paths.rest_to_rest(start=(0.0, -1.2), end=(4.0, 0.3), duration=4.0, smoothness=6)
+    r = q.references(across=path[0], up=path[1])
+    return mechanism, sv.Program({"across": load[0] - r.across, "up": load[1] - r.up}, by="actuators")
 
 
 def slung_load_3d():
@@ -57,9 +58,9 @@ def slung_load_3d():
     rates = sv.body_rates(q, axes)
     S = sv.rigid_body(q, p.m, (p.J, p.J, p.J_z), position=body, rates=rates) + sv.particle(q, p.m_load, load)
     turning = ca.jacobian(rates, ca.vertcat(*q.d(1))).T  # a column for each moment
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=5.0, smoothness=6)
-    turn = sv.paths.circle(ca.pi / 2 * (s - 1), centre=(0.0, 2.0), radius=2.0)
-    path = ca.vertcat(turn, sv.paths.line(s, -1.2, -0.2))
+    (s,) = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=5.0, smoothness=6))
+    turn = sv.curves.circle(ca.pi / 2 * (s - 1), centre=(0.0, 2.0), radius=2.0)
+    path = ca.vertcat(turn, sv.curves.line(s, -1.2, -0.2))
     mechanism = sv.Mechanism(
         q,
         gibbs=S,

@@ -45,7 +45,7 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
     q = sv.coordinates(" ".join(f"x{i}" for i in range(1, N + 1)), units="m " * N)
     x, m, k, gap = tuple(q), p.symbols[:N], p.symbols[N : 2 * N - 1], p.symbols[2 * N - 1 :]
     stretch = ca.vertcat(*(x[i] - x[i + 1] - gap[i] for i in range(N - 1)))
-    path = sv.paths.rest_to_rest(q.t, 0.5, 2.5, duration=2.0, smoothness=max(6, 2 * N))
+    r = q.references(x1=sv.paths.rest_to_rest(0.5, 2.5, duration=2.0, smoothness=max(6, 2 * N)))
     mechanism = sv.Mechanism(
         q,
         gibbs=sum(sv.particle(q, m[i], x[i]) for i in range(N)),
@@ -55,7 +55,7 @@ def cars(N=2, masses=None, stiffnesses=None, gaps=None, by="actuators"):
         | {f"car {i}": sv.shapes.box((x[i - 1], 0), 0.2, 0.15) for i in range(N, 0, -1)},
         parameters=p,
     )
-    return mechanism, sv.Program({"car 1": x[0] - path}, by=by)
+    return mechanism, sv.Program({"car 1": x[0] - r.x1}, by=by)
 
 
 def _numbered(letter, what, values, default):

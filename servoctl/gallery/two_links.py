@@ -18,7 +18,8 @@ def two_link_arm():
     p = sv.parameters(m1=4.0, m2=3.0, l1=0.6, l2=0.5, I1=0.12, I2=0.07, g=9.81)  # kg, kg, m, m, kg m^2, kg m^2, m/s^2
     q = sv.coordinates("q1 q2", units="rad rad")  # from the horizontal, relative
     end, S, height, shapes = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
-    path = sv.paths.rest_to_rest(q.t, start=(0.6, 0.4), end=(0.2, 0.9), duration=2.0, smoothness=2)
+    path = sv.paths.rest_to_rest(start=(0.6, 0.4), end=(0.2, 0.9), duration=2.0, smoothness=2)
+    r = q.references(X=path[0], Y=path[1])
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
@@ -29,7 +30,7 @@ def two_link_arm():
         shapes=shapes,
         parameters=p,
     )
-    return mechanism, sv.Program({"X": end[0] - path[0], "Y": end[1] - path[1]}, by="actuators")
+    return mechanism, sv.Program({"X": end[0] - r.X, "Y": end[1] - r.Y}, by="actuators")
 
 
 def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
@@ -57,7 +58,7 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
     q1, _ = q
     end_point, S, height, shapes = _links(q, (p.m1, p.m2), (p.l1, p.l2), (p.I1, p.I2))
     degree = ca.pi / 180
-    path = sv.paths.rest_to_rest(q.t, start * degree, end * degree, duration=duration, smoothness=2)
+    r = q.references(angle=sv.paths.rest_to_rest(start * degree, end * degree, duration=duration, smoothness=2))
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
@@ -69,7 +70,7 @@ def pendubot(start=-90.0, end=0.0, duration=3.0, damping=0.05):
         shapes=shapes,
         parameters=p,
     )
-    return mechanism, sv.Program({"angle": q1 - path}, by="actuators")
+    return mechanism, sv.Program({"angle": q1 - r.angle}, by="actuators")
 
 
 def passive_arm(Gamma=0.3):
@@ -92,7 +93,7 @@ def passive_arm(Gamma=0.3):
     q = sv.coordinates("q1 q2", units="rad rad")  # the second is relative
     q1, q2 = q
     _, S, _, shapes = _links(q, (p.m, p.m), (p.l, p.l), (p.I, p.I))
-    path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=2.0, smoothness=4)
+    r = q.references(angle=sv.paths.rest_to_rest(0.0, pi / 2, duration=2.0, smoothness=4))
     mechanism = sv.Mechanism(
         q,
         gibbs=S,
@@ -102,7 +103,7 @@ def passive_arm(Gamma=0.3):
         shapes=shapes,
         parameters=p,
     )
-    return mechanism, sv.Program({"angle": q1 + p.Gamma * q2 - path}, by="actuators")
+    return mechanism, sv.Program({"angle": q1 + p.Gamma * q2 - r.angle}, by="actuators")
 
 
 def _links(q, masses, lengths, inertias):

@@ -34,7 +34,8 @@ def wheeled_robot(turn=90.0, speed=1.0, duration=4.0):
     v, r = q.w()
 
     c = turn * ca.pi / 180 * 2 * ca.pi / (speed * duration**2)  # 1/(m s): heading change = c v T^2/(2π)
-    rate = ca.if_else(q.t < duration, c * ca.sin(2 * ca.pi * q.t / duration), 0)
+    phase = sv.paths.rest_to_rest(0.0, 2 * ca.pi, duration=duration, smoothness=0)  # at a constant rate
+    rate = c * ca.sin(q.references(phase=phase).phase)
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.rigid_body(q, p.m, (0, 0, p.J), position=(x, y), rates=(0, 0, r)),

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from servoctl.checks import MOST_COUNT, as_list, positive, require_kind, whole, without_effect
+from servoctl.checks import MOST_COUNT, as_list, named, positive, require_kind, whole, without_effect
+from servoctl.codegen.paths import jets_in
 from servoctl.control.conditions import limits, steps
 from servoctl.control.law import Law
 from servoctl.control.loop import hold, limited, quantised, samples_ago
@@ -23,18 +24,19 @@ from servoctl.model.following import p_with
 from servoctl.model.model import Model
 from servoctl.plants.plant import Plant
 from servoctl.reduction.reduce import require_outputs
+from servoctl.spec.references import require_fixed
 
 SUBSTEPS = 10  # Runge-Kutta steps per sample: 1 ms at 100 Hz
 
 
-def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
+def nlsys(thing, *, rate=None, substeps=None, disturbed=(), references="path", name=None):
     """A model, plant, law or closed loop as a `control.NonlinearIOSystem`.
 
-    A model has no inputs: its states follow the program; its outputs are the states, the required actuation (or
-    reaction) and the mechanism's outputs. A plant's inputs are its actuators, its outputs the states and the
-    mechanism's outputs. A law is sampled (dt = 1/rate) from the measurement to the actuators. A closed loop is the
-    `control.interconnect` of its sampled plant and its law; its inputs are "disturbance NAME" of each generalised force
-    and "noise NAME" of each measured state, its outputs those of the plant and "command NAME".
+    A model has no inputs, or those of its references: its states follow the program; its outputs are the states, the
+    required actuation (or reaction) and the mechanism's outputs. A plant's inputs are its actuators, its outputs the
+    states and the mechanism's outputs. A law is sampled (dt = 1/rate) from the measurement to the actuators. A closed
+    loop is the `control.interconnect` of its sampled plant and its law; its inputs are "disturbance NAME" of each
+    generalised force and "noise NAME" of each measured state, its outputs those of the plant and "command NAME".
 
     Parameters
     ----------
@@ -47,6 +49,9 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
         Runge-Kutta steps of order 4 per sample of a plant; default 10.
     disturbed : sequence of str
         Generalised forces, and parameters that enter forces only, of a plant that have an input "disturbance NAME".
+    references : {"path", "inputs"}
+        Whether a model follows the paths of its references, or has these and their derivatives as inputs: "X", "dX",
+        "d2X", ...
     name : str, optional
         Name of the system; default "model", "plant", "law" or "loop".
 
@@ -60,15 +65,18 @@ def nlsys(thing, *, rate=None, substeps=None, disturbed=(), name=None):
     SpecificationError
         For other objects, options that do not apply, and limits of rate or delays in continuous time.
     NameUnknown
-        For a disturbance of what is no generalised force or parameter.
+        For a disturbance of what is no generalised force or parameter, and other `references`.
     """
     require_kind((Model, Plant, Law, Closed), "thing", thing, SYSTEMS)
+    as_inputs = named(references, ("path", "inputs"), "form of references") == "inputs"
+    if as_inputs and not (isinstance(thing, Model) and thing.reduction.references):
+        without_effect(["references"], "for what is no model with references")
     if isinstance(thing, Plant):
         return _plant(thing, system_name(name, "plant"), disturbed, rate, substeps)
     given = {"rate": rate, "substeps": substeps, "disturbed": None if as_list(disturbed) == [] else disturbed}
     without_effect([name for name, value in given.items() if value is not None], f"for a {type(thing).__name__}")
     if isinstance(thing, Model):
-        return _model(thing, system_name(name, "model"))
+        return _model(thing, system_name(name, "model"), as_inputs)
     if isinstance(thing, Law):
         return _law(thing, system_name(name, "law"))
     return _closed(thing, system_name(name, "loop"))
@@ -96,7 +104,7 @@ def start(closed):
     return np.concatenate([loop.x0, np.tile(loop.initial_input, past), loop.z0])
 
 
-def _model(model, name):
+def _model(model, name, as_inputs):
     import control
 
     n, n_x, p = model.n, len(model.state_names), model.parameters
@@ -104,12 +112,11 @@ def _model(model, name):
     groups = [model.signals("reaction" if model.reduction.ideal else "actuation"), model.signals("outputs")]
     names = [name for group, _ in groups for name in group]
     ode, symbols = model.function("ode"), model.reduction.mechanism.parameters.names
+    inputs, at = _along_inputs(model, (ode, *(f for _, f in groups))) if as_inputs else ([], _along_paths(model))
 
-    def numbers(params):
-        return p_with(model, _parameter_values(p, symbols, params))
-
-    def rates(t, x, _, params):
-        y = ode(t, x, numbers(params))[:n_x]
+    def rates(t, x, u, params):
+        _require_fixed_in(model, model.reduction.mechanism, p, params)
+        y = at(ode, t, x, u, _parameter_values(p, symbols, params))[:n_x]
         if not np.isfinite(y).all():
             raise ServoError(
                 f"The reduced dynamics is not finite at t = {t:.6g} s.",
@@ -120,18 +127,44 @@ def _model(model, name):
         return y
 
     def outputs(t, x, u, params):
-        z = np.append(x, rates(t, x, u, params)[-n:])
-        return np.concatenate([x, *(f(t, z, numbers(params)) for group, f in groups if group)])
+        z, numbers = np.append(x, rates(t, x, u, params)[-n:]), _parameter_values(p, symbols, params)
+        return np.concatenate([x, *(at(f, t, z, u, numbers) for group, f in groups if group)])
 
     return control.nlsys(
         rates,
         outputs,
         name=name,
-        inputs=0,
+        inputs=inputs or 0,
         states=model.state_names,
         outputs=[*model.state_names, *names],
         params=dict(zip(symbols, p.tolist(), strict=True)),
     )
+
+
+def _along_paths(model):
+    """A function's values at a state along the paths that a model follows, whatever the inputs."""
+    return lambda f, t, x, _, numbers: f(t, x, p_with(model, numbers))
+
+
+def _along_inputs(model, functions):
+    """Names of the jets that functions of a model take, and their values at a state with these as inputs."""
+    count = max(f.expression.size2_in(3) if jets_in(f.expression) else 0 for f in functions)
+    jet, followed = model.reduction.mechanism.q.family.jet, model.reduction.references
+
+    def at(f, t, x, u, numbers):
+        jets = np.reshape(u, (count, -1)).T
+        some = [jets[:, : f.expression.size2_in(3)]] if jets_in(f.expression) else []
+        return np.ravel(f.expression(t, x, np.append(0.0, numbers), *some))
+
+    return [jet(name, k).name() for k in range(count) for name in followed], at
+
+
+def _require_fixed_in(thing, mechanism, p, params):
+    """Refuse python-control's params by which the paths of a model or a plant would be others."""
+    if thing.paths:
+        own = zip(mechanism.parameters.names, p, strict=False)
+        changes = [name for name, value in own if params[name] != value]
+        require_fixed(thing.paths, mechanism.parameters, changes, "python-control changes")
 
 
 def _parameter_values(p, symbols, params):
@@ -152,6 +185,7 @@ def _plant(plant, name, disturbed, rate, substeps, delay=0):
     ode, low_high = plant.function("ode"), limits(plant, 1.0)[:2]
 
     def numbers(u, params):
+        _require_fixed_in(plant, plant.mechanism, plant.parameters, params)
         applied, calm = np.clip(u[:m], *low_high), np.zeros(len(plant.disturbable))
         p = np.concatenate([plant.place, _parameter_values(plant.parameters, symbols, params), applied, calm])
         p[places] = u[m:]

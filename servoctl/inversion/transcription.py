@@ -5,7 +5,7 @@ satisfy x' = f(t, x, u). Inputs are continuous; on an interval they are polynomi
 form: they stay within the hull of their control points, so that limits of these points hold at all instants.
 """
 
-from functools import cached_property
+from functools import cached_property, partial
 from math import comb
 
 import casadi as ca
@@ -42,7 +42,9 @@ class Node:
         k = residuals.numel()
         self.residuals, self.effort, self.bounded = values[:k], values[k], values[k + 1 :]
         kinematics = [self.known(each) for each in (self.q.V, self.q.h, plant.mechanism.mass, plant.mechanism.E)]
-        self._jets = Jets(self.q, [values, self.rates, self.acceleration, *kinematics], self.q.family.paths)
+        numbers = plant.mechanism.parameters, plant.parameters
+        self.jets_of = partial(Jets, self.q, paths=self.q.family.paths, numbers=numbers)
+        self._jets = self.jets_of([values, self.rates, self.acceleration, *kinematics])
         self.instant = ca.vertcat(self.q.t, self._jets.symbols)
 
     def at(self, t):
@@ -51,8 +53,8 @@ class Node:
 
     def breaks(self, low, high):
         """Instants [s] at which the references switch between polynomials, a list."""
-        paths = {name: self.q.family.paths[name].held() for name, _ in self._jets.places}
-        return [t for path in paths.values() for t in path.breaks_below(np.inf, low, high).tolist()]
+        paths = [path.held() for path in self._jets.paths.values()]
+        return [t for path in paths for t in path.breaks_below(np.inf, low, high).tolist()]
 
     def known(self, expression):
         """An expression of the mechanism with the plant's numbers."""

@@ -16,7 +16,7 @@ from servoctl.model.rests import RANK, Rests
 from servoctl.model.start import State
 from servoctl.plants.plant import refuse_references
 from servoctl.simulation import simulated
-from servoctl.spec.references import Jets, rates_in_time, required_paths
+from servoctl.spec.references import Jets, paths_at, rates_in_time, required_paths
 from servoctl.values import frozen
 
 EXCEEDED = 1e-6  # of a bound: excess between its instants that a run reports, and at the ends that is refused
@@ -143,7 +143,7 @@ class Transfer:
         orders = {name: q.order(e) for name, e in self.program.residuals.items()}
         rates = [rates_in_time(q, e) if orders[name] <= 0 else e for name, e in self.program.residuals.items()]
         values = ca.substitute(self.node.known(ca.vertcat(*rates)), moving, ca.SX.zeros(moving.numel()))
-        jets = Jets(q, [values], q.family.paths)
+        jets = self.node.jets_of([values])
         f = ca.Function("rates", [q.t, jets.symbols, ca.vertcat(*q)], [values])
         some = np.full(self.nq, 0.3)  # a place where expressions of the coordinates have values
         times = np.linspace(*self.span, 101)
@@ -371,6 +371,7 @@ def rests(plant, program):
     if not found.references:
         return found, numbers
     followed = required_paths({name: paths[name] for name in found.references})
+    followed = paths_at(followed, plant.mechanism.parameters, numbers)
     found.followed = Followed([path.held() for path in followed.values()])
     return found, np.append(found.followed.address, numbers)
 

@@ -73,17 +73,15 @@ class Series:
     """A tape run on truncated power series, one coefficient at a time.
 
     `inputs` has a list of coefficients for each input: before `advance()` computes coefficient k, at least k + 1 of
-    them. Branches are taken by the values of nodes in `decided`, a dict, or else by their coefficients 0. `c` has the
-    coefficients of each node so far, `k` is their number.
+    them. Branches are taken by coefficients 0. `c` has the coefficients of each node so far, `k` is their number.
     """
 
-    def __init__(self, tape, inputs, decided=None):
+    def __init__(self, tape, inputs):
         self.tape = tape
         self.nodes = tape.nodes
         self.inputs = inputs
         self.c = [[] for _ in self.nodes]
         self.k = 0
-        self.decided = decided or {}
 
     @property
     def outputs(self):
@@ -126,7 +124,7 @@ class Series:
         if kind == "quad":
             return self._quadrature(node, k)
         if kind == "constant":
-            return apply(data, *(self._deciding(j) for j in args)) if k == 0 else 0.0
+            return apply(data, *(self.c[j][0] for j in args)) if k == 0 else 0.0
         a = c[args[0]]
         if kind == "neg":
             return 0.0 if is_zero(a[k]) else -a[k]
@@ -157,19 +155,14 @@ class Series:
         """Whether a node has a function that may overflow among its arguments."""
         return self.tape.growing[node]
 
-    def _deciding(self, node):
-        """The value of a node by which branches are taken."""
-        return self.decided[node] if node in self.decided else self.c[node][0]
-
     def _branch(self, node, k):
         """Coefficient k of an operation with branches: that of the branch taken."""
         a, b = (self.c[i] for i in (node.args[0], node.args[-1]))
         if node.kind == "fabs":
-            return select(self._deciding(node.args[0]) >= 0, a[k], -a[k])
+            return select(a[0] >= 0, a[k], -a[k])
         if node.kind == "gate":
             return 0.0 if is_zero(b[k]) else select(holds(a[0]), b[k], 0.0)
-        first_is_least = self._deciding(node.args[0]) <= self._deciding(node.args[1])
-        return select(first_is_least, *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
+        return select(a[0] <= b[0], *((a[k], b[k]) if node.kind == "fmin" else (b[k], a[k])))
 
     @staticmethod
     def _square(a, k):
@@ -218,7 +211,7 @@ class _Grouped(Series):
         self.tape, self.inputs, (self.plan, self.growing) = tape, inputs, tape.plan_of(first)
         self.nodes, self.places = self.plan.grouped
         self.shape, self.values = (len(self.plan.place), n_points), []  # coefficients of all operations
-        self.c, self.k, self.decided = [[] for _ in self.nodes], 0, {}
+        self.c, self.k = [[] for _ in self.nodes], 0
 
     def advance(self):
         """Compute the next coefficient of every group."""

@@ -83,7 +83,7 @@ def fits(model):
         alone = not model.reduction.orders and switching(model) is None and not steep(model, squares=False)
         return alone and not ca.depends_on(f(*inputs), inputs[0])
 
-    return not (model.flat or model.knots or model.paths) and model.once("fits lanes", smooth)
+    return not (model.flat or model.paths) and model.once("fits lanes", smooth)
 
 
 def integrate(model, last, span, cases, rtol, times, threads=None, progress=None):

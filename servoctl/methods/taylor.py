@@ -27,7 +27,6 @@ from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
-from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate
 from servoctl.values import frozen
 
@@ -37,31 +36,8 @@ FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series o
 STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
 LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
+OF_PIECE = ca.SX.sym("t_of_piece")  # the instant that selects pieces of paths
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
-
-
-class _Branches(Series):
-    """Series whose branches stay where they are taken.
-
-    CasADi draws the condition of an if_else_zero out of each product with it, and of each product with that product:
-    in paths with pieces, conditions were two thirds of all operations. It draws nothing through copysign(c, c) = c.
-    """
-
-    def _branch(self, node, k):
-        c = super()._branch(node, k)
-        return ca.copysign(c, c) if isinstance(c, ca.SX) and not c.is_constant() else c
-
-
-def _decided(q, symbols, tape, instant):
-    """Values of the nodes of a tape that depend on time alone, at the instant that selects branches."""
-    places = [q.where(s) for s in symbols]
-    timed = [place is None or place[0] == "t" for place in places]
-    at = [[instant if place and place[0] == "t" else s] for s, place in zip(symbols, places, strict=True)]
-    values, alone = Series(tape, at), []
-    values.advance()
-    for node in tape.nodes:
-        alone.append(timed[node.data] if node.kind == "input" else all(alone[a] for a in node.args))
-    return {i: values.c[i][0] for i, of_time in enumerate(alone) if of_time}
 
 
 class _Group:
@@ -72,8 +48,7 @@ class _Group:
         self.symbols = ca.symvar(ca.vertcat(*expressions))
         self.inputs = [[] for _ in self.symbols]
         constants = {i for i, symbol in enumerate(self.symbols) if motion.q.where(symbol) is None}
-        tape = constants_outside(Tape(self.symbols, expressions), constants)
-        self.series = _Branches(tape, self.inputs, _decided(motion.q, self.symbols, tape, motion.branch))
+        self.series = Series(constants_outside(Tape(self.symbols, expressions), constants), self.inputs)
 
     def advance(self, k):
         """Coefficient k - order of the rows, from the motion's coefficients up to k."""
@@ -88,23 +63,12 @@ class _Group:
         self.series.replace_last({i: self.motion.coefficient(s, j) for i, s in enumerate(self.symbols)})
 
 
-class _InBlock(Running):
-    """Rows of a block with their series, whose branches stay where an instant selects them."""
-
-    instant = ca.SX.sym("t_branch")
-
-    def run(self, tape):
-        decided = _decided(self.motion.q, self.symbols, tape, self.instant)
-        return _Branches(tape, [[] for _ in self.symbols], decided)
-
-
 class _Motion(Motion):
     """Coefficients of q and γ up to an index."""
 
     def __init__(self, equations):
         super().__init__(equations.q)
-        self.top, self.branch = equations.top, ca.SX.sym("t_branch")
-        self.gamma = {}
+        self.top, self.gamma = equations.top, {}
         self.coordinates = {0: list(self.q)}
         moving = (self.q.V @ ca.vertcat(*self.q.gamma(1)) + self.q.h).elements()
         self.kinematics = None if self.q.plain else _Group(self, 1, range(self.q.nq), moving)
@@ -229,18 +193,18 @@ class _Reacting(_Motion):
 def taylor_coefficients(equations, last):
     """Normalised Taylor coefficients of q and γ with index 1 .. last ≥ s̄ + 1 at a state, as a function of (t, X, p).
 
-    p ends with the instant that selects the branches of paths. Outputs are q_[1], ..., q_[last] (if q' ≠ γ'), γ_[1],
+    p ends with the instant that selects the pieces of paths. Outputs are q_[1], ..., q_[last] (if q' ≠ γ'), γ_[1],
     ..., γ_[last], and pivots.
     """
     r = equations.r
     if r.cascade is not None:
-        motion = r.cascade.along(r.points, equations.top - 1, last, running=_InBlock)
-        return _coefficients(equations, motion.place, motion.gamma, last, _InBlock.instant)
+        motion = r.cascade.along(r.points, equations.top - 1, last)
+        return _coefficients(equations, motion.place, motion.gamma, last)
     if equations.definite:
         motion = _with_multipliers(equations, last)
-        return _coefficients(equations, motion.coordinates, motion.gamma, last, motion.branch)
+        return _coefficients(equations, motion.coordinates, motion.gamma, last)
     rows = _by_rows(equations, last)
-    return _coefficients(equations, rows.motion.coordinates, rows.motion.gamma, last, rows.motion.branch, rows.by_rows)
+    return _coefficients(equations, rows.motion.coordinates, rows.motion.gamma, last, rows.by_rows)
 
 
 def _by_rows(equations, last):
@@ -289,12 +253,12 @@ def _right(groups, k):
     return ca.vertcat(*(right[a] for a in sorted(right)))
 
 
-def _coefficients(equations, coordinates, gamma, last, instant, finished=list):
+def _coefficients(equations, coordinates, gamma, last, finished=list):
     """What `taylor_coefficients` returns, from coefficients by index."""
     coefficients = [] if equations.q.plain else [ca.SX(c) for k in range(1, last + 1) for c in coordinates[k]]
     coefficients += [ca.SX(c) for k in range(1, last + 1) for c in gamma[k]]
     outputs = finished([*coefficients, *(g for _, g in equations.pivots)])
-    return equations.function("taylor", equations.state, outputs, instant, BY_INSTANT)
+    return equations.function("taylor", equations.state, outputs, OF_PIECE, BY_INSTANT)
 
 
 def settled(equations):
@@ -305,7 +269,7 @@ def settled(equations):
     rows = _by_rows(equations, equations.top)
     gamma = [ca.SX(c) * float(factorial(k)) for k in range(1, equations.top + 1) for c in rows.motion.gamma[k]]
     outputs = rows.by_rows([*equations.q, *gamma])
-    return equations.function("settled", equations.state, outputs, rows.motion.branch, BY_INSTANT)
+    return equations.function("settled", equations.state, outputs, OF_PIECE, BY_INSTANT)
 
 
 def series_loop(model, last):
@@ -443,10 +407,10 @@ class TaylorSteps(Stepping):
         return cuts[-1:]
 
     def _outputs(self, t, x):
-        return self.f(t, x, self._on_branch(t))
+        return self.f(t, x, self._on_piece(t))
 
-    def _on_branch(self, t):
-        """The parameters, and an instant of the piece that follows t, which selects the branches of paths."""
+    def _on_piece(self, t):
+        """The parameters, and an instant of the pieces of paths that follow t."""
         k = min(max(self._next(t), 1), len(self.cuts) - 1)
         self.p[-1] = (self.cuts[k - 1] + self.cuts[k]) / 2
         return self.p
@@ -472,7 +436,7 @@ class TaylorSteps(Stepping):
         self.watch.begin(a)
         until = b
         while a != b and self.motion.stop is None:
-            p, ends = self._on_branch(a), self._until(a, until)
+            p, ends = self._on_piece(a), self._until(a, until)
             rows = self.f.taylor(a, x, ends, p, *self.tolerances, self.most, self.every)
             log = _Log(self.f, self.n_x, p, rows)
             taken, good = len(rows) - 1, self._believed(log, abs(b - a))
@@ -505,7 +469,7 @@ class TaylorSteps(Stepping):
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             row = np.concatenate([[a], x, self._outputs(a, x)])
-            self._sample(_Log(self.f, self.n_x, self._on_branch(a), np.array([row, row])), times, a)
+            self._sample(_Log(self.f, self.n_x, self._on_piece(a), np.array([row, row])), times, a)
         return a, x
 
     def _doubt(self, t):
@@ -584,7 +548,7 @@ class TaylorSteps(Stepping):
             more = centres(steep, self.model.p, parts[0], dense(parts[0]), dense)
             k, at = np.append(k, steps_of(t, more)), np.append(at, more)
         within = at != t[k]
-        if self.knots:  # where paths have other branches
+        if self.knots:  # where paths have other pieces
             within &= ~np.isin(at, [end for end in t.tolist() if end in self.knots])
         return k[within], at[within]
 

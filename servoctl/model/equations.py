@@ -48,11 +48,14 @@ class Invariants:
             self._motions[given, correct] = self.cascade.along(self.points, given, max(given, self.top), correct)
         return self._motions[given, correct]
 
-    def function(self, name, x, outputs, extra=None, jets="r"):
-        """An SX function of (t, x, p) with one dense column; see `references.function_of`."""
+    def function(self, name, x, outputs, extra=None, jets="r", rates=()):
+        """An SX function of (t, x, p) with one dense column; see `references.function_of`.
+
+        `rates` are pairs (reference, parameter) of derivatives that it takes behind the references.
+        """
         p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
         y = ca.densify(cse(ca.vertcat(*outputs)))
-        return function_of(self.q, self.references, name, x, p, y, jets=jets)
+        return function_of(self.q, (*self.references, *rates), name, x, p, y, jets=jets)
 
     def called(self, f, x, p):
         """The output of one of the model's functions as an expression; see `references.called`."""

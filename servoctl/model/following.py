@@ -5,27 +5,28 @@ from math import factorial
 
 import numpy as np
 
+from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.model.points import with_place
+from servoctl.spec.paths.parametric import parameters_of
+from servoctl.spec.paths.value import SAME
 from servoctl.spec.references import required_paths
 
 SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
 
 
-def breaks_within(model, span, smoother=np.inf):
-    """Instants (N,) within a span at which a path has fewer continuous derivatives than a motion by some method needs.
+def breaks_within(model, span, smoother=SMOOTHER):
+    """Instants within a span at which a path has fewer continuous derivatives than a motion by some method needs.
 
     That are `smoother` more than the actuation contains. SpecificationError where it has fewer than these.
     """
-    if not model.paths:
-        return np.zeros(0)
-    low, high, found = min(span), max(span), []
+    low, high, found = min(span), max(span), set()
     for name, path in model.paths.items():
         needs = model.reduction.follows[name]
         require_class(name, path, needs, (low, high), model.reduction.program.jumps)
-        found.append(path.held().breaks_below(needs + smoother, low, high))
-    return np.unique(np.concatenate(found))
+        found |= {*path.held().breaks_below(needs + smoother, low, high).tolist()}
+    return tuple(sorted(found))
 
 
 def require_class(name, path, needs, span, jumps):
@@ -56,6 +57,7 @@ def require_class(name, path, needs, span, jumps):
             + ("." if jumps else ", or write Program(..., jumps=True) where forces may jump."),
             name=name,
             needs=needs,
+            has=class_,
             t=float(inside[0]),
         )
 
@@ -71,6 +73,59 @@ def p_with(model, parameters):
     return with_place((model._followed.address,) if model.paths else (), parameters)
 
 
+def moved_by(model, names):
+    """Pairs (reference, parameter) of the paths that contain some of the parameters, by their names."""
+    written = _written(model)
+    return tuple((r, n) for r, path in model.paths.items() for n in names if written.get(n) in parameters_of(path))
+
+
+def p_with_rates(model, pairs):
+    """The parameters of compiled functions that take derivatives of references by parameters behind the references."""
+    if not pairs:
+        return model.p
+    known = model._rates_followed
+    if pairs not in known:
+        rates = []
+        for reference in dict.fromkeys(r for r, _ in pairs):  # pairs are in their order
+            of = [_written(model)[name] for r, name in pairs if r == reference]
+            rates += model.paths[reference].source.rates(_numbers(model), of)
+        known[pairs] = Followed([*model._followed.paths, *(rate.held() for rate in rates)])
+    return with_place((known[pairs].address,), model.parameters)
+
+
+def instant_by(model, name, t):
+    """The derivative by a parameter of an instant t [s] at which paths may make forces jump; None where none does.
+
+    SpecificationError where breaks of several paths meet that move differently.
+    """
+    rates, written = {}, _written(model)[name]
+    for reference, path in model.paths.items():
+        k = int(np.argmin(np.abs(path.breaks - t)))
+        if path.classes[k] <= model.reduction.follows[reference] and abs(path.breaks[k] - t) <= SAME * abs(t):
+            moves = written in parameters_of(path)
+            rates[reference] = path.source.moved(_numbers(model), written)[k] if moves else 0.0
+    if len({*rates.values()}) > 1:
+        raise SpecificationError(
+            f"At t = {t:.6g} s the paths of {', '.join(rates)} have breaks that move differently with {name!r}.",
+            "Forces jump there, and derivatives by a parameter are those of jumps apart from each other.",
+            do="Give the paths a higher smoothness, or breaks at different instants.",
+            t=float(t),
+            name=name,
+        )
+    return next(iter(rates.values()), None)
+
+
+def _written(model):
+    """Names of the parameters as paths have them, by those of the model."""
+    parameters = model.reduction.mechanism.parameters
+    return {name: symbol.name() for name, symbol in zip(parameters.names, parameters.symbols, strict=True)}
+
+
+def _numbers(model):
+    """Values of the parameters as paths have them."""
+    return dict(zip(_written(model).values(), model.parameters.tolist(), strict=True))
+
+
 def instants_of(model, t):
     """Instants (N, 1 + R) of times (N,) [s]: with the jets of the paths that a model follows there."""
     family = model.reduction.mechanism.q.family
@@ -83,6 +138,6 @@ def instants_of(model, t):
 
 
 def corners_of(model):
-    """Instants at which paths switch between smooth pieces, with the breaks of those that references follow."""
+    """Instants at which the paths that a model follows have a break."""
     paths = required_paths(model.paths).values()
-    return tuple(sorted({*model.knots, *chain.from_iterable(path.breaks[np.isfinite(path.classes)] for path in paths)}))
+    return tuple(sorted({*chain.from_iterable(path.breaks[np.isfinite(path.classes)].tolist() for path in paths)}))

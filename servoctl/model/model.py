@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
@@ -14,7 +15,7 @@ from servoctl.codegen.paths import Followed
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
-from servoctl.model.following import SMOOTHER, breaks_within, instants_of, p_with
+from servoctl.model.following import instants_of, p_with
 from servoctl.model.jets import jet_names_to
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
@@ -25,13 +26,15 @@ from servoctl.model.variants import form_of, place_of
 from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
-from servoctl.reduction.knots import require_smooth
 from servoctl.reduction.reduce import holds, reduce, require_parts, strong
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
-from servoctl.spec.references import other_paths, required_paths
+from servoctl.spec.references import other_paths, paths_at, required_paths
 from servoctl.values import evenly, read_only
+
+if TYPE_CHECKING:
+    from servoctl.streaming import Feedforward
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 
@@ -63,8 +66,8 @@ def derive(
     Raises
     ------
     SpecificationError
-        For constraints that depend on or contradict each other, an unknown symbol, a path that is not smooth
-        enough, a singular mass matrix.
+        For constraints that depend on or contradict each other, an unknown symbol, a switch in q.t, a singular mass
+        matrix.
     NotRealisable
         If the actuators cannot realise the program.
     SingularProgram
@@ -106,25 +109,6 @@ def default_start(model: "Model", t: float = 0.0) -> State:
     return model.start(t, {name: value for name, value in guess.items() if name in model.state_names})
 
 
-def knots_within(model: "Model", span: tuple, smoother=SMOOTHER) -> tuple:
-    """Knots of the paths within a span, in either direction; SpecificationError if a path is not smooth enough there.
-
-    Of paths of references those with fewer than `smoother` continuous derivatives beyond those in the actuation.
-    Of a spline of many pieces they are those between the first and the last that are inspected; the others, at which
-    series end, are `Switches.ends_of_pieces`.
-    """
-    r, span = model.reduction, (min(span), max(span))
-    if r.timed and span not in model._knots_within:
-
-        def build():
-            return require_smooth(r.switches, model.parameters, r.smoothness, span).times
-
-        # The entries of the store belong to the numbers of the specification.
-        stored = np.array_equal(model.parameters, r.context.values)
-        model._knots_within[span] = model._store.recall(f"knots {span}", build) if stored else build()
-    return tuple(sorted({*model._knots_within.get(span, ()), *breaks_within(model, span, smoother).tolist()}))
-
-
 class Model(Detailed):
     """Reduced dynamics and required actuation of a program; made by `derive`.
 
@@ -137,23 +121,16 @@ class Model(Detailed):
         The rows of the motion.
     parameters : (n_p,) array
         Values of the parameters.
-    state_names : tuple of str
-        Names of the state X = (q, γ', ..., γ^(s̄-1)).
-    jet_names : tuple of str
-        Names of the jets Z = (X, γ^(s̄)).
     """
 
-    def __init__(self, reduction, store, values=None, knots=None, functions=None, variants=None, paths=None):
+    def __init__(self, reduction, store, values=None, functions=None, variants=None, paths=None):
         q = reduction.mechanism.q
-        self.paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
         self.reduction, self._store = reduction, store
         self.parameters = read_only(reduction.context.values.copy() if values is None else values)
-        self._knots = reduction.knots if knots is None else knots
-        self.state_names = tuple(name for k in range(reduction.top) for name in q.jet_names(k))
-        self.jet_names = (*self.state_names, *q.jet_names(reduction.top))
+        paths = {name: q.family.paths[name] for name in reduction.references} if paths is None else paths
+        self.paths = paths_at(paths, reduction.mechanism.parameters, self.parameters)
         # Models that differ only in numbers share their functions.
         self._functions = {} if functions is None else functions
-        self._knots_within = {}  # by time span
         self._variants = {None: self} if variants is None else variants  # with other pivots: one set for all of them
 
     @classmethod
@@ -175,7 +152,7 @@ class Model(Detailed):
 
     def __reduce__(self):
         mechanism, _, *choices = self._store.specification
-        return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self._knots, self.paths)
+        return _unpickled, (mechanism, pack(self.reduction), choices, self.parameters, self.paths)
 
     def with_parameters(self, **changes: float) -> "Model":
         """The same model with other parameters.
@@ -196,7 +173,7 @@ class Model(Detailed):
         NameUnknown
             For a name that is no parameter.
         SpecificationError
-            For a value that is not finite, makes a mass negative, or makes a path less smooth than required.
+            For a value that is not finite, or makes a mass negative.
         """
         r = self.reduction
         current = self.numbers
@@ -206,9 +183,8 @@ class Model(Detailed):
             require_positive(r.mechanism, replace(r.points, values=values))
             if not self._holds(values):
                 self._store.require_unchanged()
-                return self._of(r.mechanism, r.program, r.context.guess, None, values)
-        knots = require_smooth(r.switches, values, r.smoothness)
-        return Model(r, self._store, values, knots, self._functions, paths=self.paths)
+                return self._of(r.mechanism, r.program, r.context.guess, None, values).with_references(**self.paths)
+        return Model(r, self._store, values, self._functions, paths=self.paths)
 
     def with_references(self, **paths) -> "Model":
         """The same model along other paths: nothing is derived, and nothing compiled.
@@ -230,15 +206,19 @@ class Model(Detailed):
             For what is no path of one component.
         """
         paths = other_paths(self.paths, paths)
-        return Model(self.reduction, self._store, self.parameters, self._knots, self._functions, paths=paths)
+        return Model(self.reduction, self._store, self.parameters, self._functions, paths=paths)
 
     def _with(self, other, functions, variants=None):
         """The reduction of another model with the numbers and paths of this one."""
-        return Model(other.reduction, other._store, self.parameters, self._knots, functions, variants, self.paths)
+        return Model(other.reduction, other._store, self.parameters, functions, variants, self.paths)
 
     @cached_property
     def _followed(self):
         return Followed([path.held() for path in required_paths(self.paths).values()])
+
+    @cached_property
+    def _rates_followed(self):
+        return {}  # tables of the paths with derivatives by parameters, by the places of these
 
     @cached_property
     def p(self):
@@ -268,6 +248,16 @@ class Model(Detailed):
         """Whether the program determines the motion completely, without internal dynamics."""
         return self.free == 0
 
+    @cached_property
+    def state_names(self):
+        """Names of the state X = (q, γ', ..., γ^(s̄-1)), a tuple."""
+        return tuple(name for k in range(self.reduction.top) for name in self.reduction.mechanism.q.jet_names(k))
+
+    @cached_property
+    def jet_names(self):
+        """Names of the jets Z = (X, γ^(s̄)), a tuple."""
+        return (*self.state_names, *self.reduction.mechanism.q.jet_names(self.reduction.top))
+
     @property
     def n(self):
         """The number of quasi-velocities."""
@@ -288,11 +278,6 @@ class Model(Detailed):
         """Names of the mechanism's outputs."""
         mechanism = self.reduction.mechanism
         return tuple(name for name in mechanism.outputs if name not in mechanism.inputs)
-
-    @property
-    def knots(self):
-        """Instants [s] at which paths switch between smooth pieces."""
-        return self._knots.times
 
     @cached_property
     def equations(self):
@@ -356,6 +341,38 @@ class Model(Detailed):
     def _rank_points(self):
         """States (n_x, points) at which ranks were decided, with the model's own parameters."""
         return points_with(self)
+
+    def feedforward(self, start: State, rate: float = 1000.0) -> "Feedforward":
+        """Forces along references that arrive in samples: `step = model.feedforward(start)`, then `step(jets)`.
+
+        For a controller's loop in real time, `export_c(model, folder, references="argument")` writes the same in C.
+
+        Parameters
+        ----------
+        start : State
+            Of the first sample, by `start`: along any path, or near the first jets if all of the motion follows.
+        rate : float, optional
+            Samples per second [Hz]; default 1000.
+
+        Returns
+        -------
+        Feedforward
+            Takes value and derivatives of each reference, `step({"X": (x, dx, ...)})`, and returns forces by name.
+
+        Raises
+        ------
+        SpecificationError
+            If the model follows no references, the start is none, or the rate is not positive.
+        """
+        from servoctl.streaming import Feedforward
+
+        if not self.paths:
+            raise SpecificationError(
+                "The model follows no references.",
+                "A feedforward takes the jets of references, sample by sample.",
+                do="Write the program with r = q.references(X=None), or simulate its plan.",
+            )
+        return Feedforward(self, start, rate)
 
     def start(
         self,
@@ -456,8 +473,8 @@ def _samples(model, motion, jets):
     return t, jets
 
 
-def _unpickled(mechanism, content, choices, parameters, knots, paths):
+def _unpickled(mechanism, content, choices, parameters, paths):
     reduction = unpack(content, mechanism)
     store = Store(mechanism, reduction.program, *choices)
     form = form_of(reduction)
-    return Model(reduction, store.part(form) if form else store, parameters, knots, paths=paths)
+    return Model(reduction, store.part(form) if form else store, parameters, paths=paths)

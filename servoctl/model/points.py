@@ -3,6 +3,7 @@
 import numpy as np
 
 from servoctl.codegen.paths import Followed, jets_in
+from servoctl.jets.tape import JETS
 from servoctl.spec.paths.value import Path
 
 PART = 1 / 3  # of the time between two points, on either side of each: their pieces do not meet
@@ -28,7 +29,7 @@ def through(reduction, functions):
     points, family = reduction.points, reduction.mechanism.q.family
     t, count = points.t.astype(float), max((f.size2_in(3) for f in functions if jets_in(f)), default=1)
     order = np.argsort(t)
-    t, jets = t[order], points.instants[order, 1:].astype(float).reshape(len(t), len(family), -1)
+    t, jets = t[order], points.instants[order, 1:].astype(float).reshape(len(t), -1, JETS + 1)
     gaps = np.concatenate([[np.inf], np.diff(t), [np.inf]])
     widths = PART * np.minimum(np.minimum(gaps[1:], gaps[:-1]), 1.0)
     breaks = np.column_stack([t - widths, t + widths]).ravel()

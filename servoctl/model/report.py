@@ -18,7 +18,7 @@ LARGEST_EXPLAINED = 20_000  # operations of the accelerations, beyond which rela
 
 def describe(model, full):
     """The lines of a printed model: what was done to the specification; if full, with what the derivation rests on."""
-    r, rows = model.reduction, (_title, _longer, _left_out, _raised, _hidden, _free, _chosen, _follows, _switches)
+    r, rows = model.reduction, (_title, _longer, _left_out, _raised, _hidden, _free, _chosen, _follows)
     texts = [fitted(lambda room, row=row: row(model, r, room), full) for row in rows]
     return "\n  ".join(filter(None, [*texts, *(_derivation(r) if full else ())])).splitlines()
 
@@ -108,10 +108,6 @@ def _follows(model, r, room):
         return f"{listed(names, room)}{each}{most}"
 
     return f"follows {'; '.join(told(order, names) for order, names in sorted(groups.items()))}" * bool(groups)
-
-
-def _switches(model, r, room):
-    return f"paths switch at t = {listed([f'{t:g}' for t in model.knots], room, unit=' s')}" * bool(model.knots)
 
 
 def _derivation(r):

@@ -16,6 +16,7 @@ from servoctl.model.following import instants_of
 from servoctl.model.jets import jet_names_to
 from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
 from servoctl.model.variants import derived_near, reordered_at, strong_near
+from servoctl.reduction.hidden import OUT_OF_REACH
 from servoctl.spec.mechanism import require_known
 from servoctl.spec.references import function_of, orders_in
 from servoctl.values import Value, frozen
@@ -603,10 +604,12 @@ def _not_found(equations, x, residuals):
         if lacks
         else f"with the residual {residuals[worst]:.2e} of the invariant {name!r}"
     )
+    far = not lacks and residuals[worst] > OUT_OF_REACH  # of what coordinates of usual size change it by
+    unit = "Check that lengths have the same unit (m, not mm), pass" if far else "Pass"
     return InconsistentStart(
         f"The search for a consistent start ended {end}.",
         "A start satisfies every constraint and its time derivatives.",
-        do="Pass a guess={...} nearer to the motion, or check that the program can hold at this time.",
+        do=f"{unit} a guess={{...}} nearer to the motion, or check that the program can hold at this time.",
         invariant=name,
         residual=float(np.inf if lacks else residuals[worst]),
     )

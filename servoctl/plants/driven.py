@@ -9,6 +9,7 @@ from servoctl.model.model import derive
 from servoctl.plants.plant import made_again
 from servoctl.spec.paths import Path, polynomials
 from servoctl.spec.paths.limited import limited
+from servoctl.spec.paths.parametric import ParametricPath
 from servoctl.spec.program import no_program
 from servoctl.spec.references import followed_path
 
@@ -47,9 +48,9 @@ def _expressions(q, values, limits):
 
     A formula within limits is one of a reference that is the time, so that motions find its kinks as any other ones.
     """
-    paths = {name: followed_path(name, value) for name, value in values.items() if isinstance(value, Path)}
-    cut = {name: limits[name] for name in limits if name not in paths}
-    paths = {name: limited(path.held(), *limits[name]) if name in limits else path for name, path in paths.items()}
+    paths = {n: followed_path(n, value) for n, value in values.items() if isinstance(value, (Path, ParametricPath))}
+    cut = {name: sides for name, sides in limits.items() if not isinstance(values[name], Path)}
+    paths |= {n: limited(paths[n].held(), *sides) for n, sides in limits.items() if n in paths and n not in cut}
     clock = {CLOCK: polynomials([0.0, 1.0], [[1.0], [0.0]], before="continue", after="continue")} if cut else {}
     q, r = q.beside(**{f"{name}_path": path for name, path in paths.items()}, **clock)
     inputs = {name: r[f"{name}_path"] if name in paths else _expression(name, values[name], q.t) for name in values}

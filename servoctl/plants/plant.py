@@ -26,7 +26,7 @@ from servoctl.markup import Shown
 from servoctl.plants.equations import PlantEquations, equations_at, plant_equations
 from servoctl.reduction.manifold import references_at
 from servoctl.spec.mechanism import Mechanism, require_known
-from servoctl.spec.references import other_paths, required_paths
+from servoctl.spec.references import other_paths, paths_at, require_fixed, required_paths
 from servoctl.values import Value, frozen
 
 
@@ -191,6 +191,9 @@ class Plant(Value, Shown):
     paths: dict
     equations: PlantEquations = field(repr=False, compare=False)
 
+    def __post_init__(self):
+        self.__dict__["paths"] = paths_at(self.paths, self.mechanism.parameters, self.parameters)
+
     def __eq__(self, other):
         return super().__eq__(other) and self.equations.choices == other.equations.choices
 
@@ -291,13 +294,14 @@ class Plant(Value, Shown):
         NameUnknown
             If the plant has neither.
         SpecificationError
-            For a parameter of inertia, kinematics or constraints, whose rate of change would act as well.
+            For a parameter of inertia, kinematics, constraints or paths, whose rate of change would act as well.
         """
         parameters = self.mechanism.parameters
         if name in self.disturbable:
             return self.at_u + len(self.inputs) + self.disturbable.index(name)
         if name not in parameters.names:
             raise self.mechanism.no("generalised force or parameter", name, (*self.disturbable, *parameters.names))
+        require_fixed(self.paths, parameters, [name], "Disturbances change")
         m, place = self.mechanism, parameters.names.index(name)
         kinds = {
             "the inertia": ca.vec(m.mass),

@@ -127,16 +127,15 @@ class Cascade:
             blocks.append(replace(block, order=tuple(pairs)))
         return replace(self, blocks=tuple(blocks))
 
-    def along(self, points, given, level, correct=False, running=None, errors=None):
+    def along(self, points, given, level, correct=False, errors=None):
         """The motion by jets up to a given level, and Newton steps to its coordinates where it is `correct`ed first.
 
         Jets up to the level `given` are symbols, 0 for coordinates alone; further ones are computed up to `level`.
-        Pivots are chosen at `points`, which have the jets of `solved`. With Newton steps rows have order 0. `running`
-        makes a `Running`, by default that class, of (motion, order, expressions). `errors` by place of a row is what is
-        added to ψ^(given + 1 - order), as by error dynamics.
+        Pivots are chosen at `points`, which have the jets of `solved`. With Newton steps rows have order 0. `errors` by
+        place of a row is what is added to ψ^(given + 1 - order), as by error dynamics.
         """
         motion = Expressions(self, points, given, correct)
-        motion.running, motion.errors = running or Running, errors or {}
+        motion.errors = errors or {}
         for block, depth in zip(self.blocks, self.depths(level), strict=True):
             motion.follow(block, depth)
         return motion
@@ -148,11 +147,7 @@ class Running:
     def __init__(self, motion, order, expressions):
         self.motion, self.order = motion, order
         self.symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *expressions))
-        self.series = self.run(Tape(self.symbols, expressions))
-
-    def run(self, tape):
-        """The series of a tape."""
-        return Series(tape, [[] for _ in self.symbols])
+        self.series = Series(Tape(self.symbols, expressions), [[] for _ in self.symbols])
 
     def advance(self):
         """The next coefficients."""
@@ -179,8 +174,6 @@ class _Follow(Motion):
     `gamma` and `place` have by k the coefficients k of γ, a list of n, and of q, a list of nq.
     """
 
-    running = Running
-
     def __init__(self, cascade, gamma, place):
         super().__init__(cascade.q)
         self.gamma, self.place = gamma, place
@@ -194,11 +187,11 @@ class _Follow(Motion):
     def follow(self, block, depth):
         """The coefficients of a block up to a level."""
         moving = self.q.V @ self.q.jet(1) + self.q.h
-        rates = None if self.q.plain else self.running(self, 1, [moving[i] for i in block.coordinates])
+        rates = None if self.q.plain else Running(self, 1, [moving[i] for i in block.coordinates])
         groups = []
         for order in sorted({row.order for row in block.rows}):
             members = [a for a, row in enumerate(block.rows) if row.order == order]
-            groups.append((self.running(self, order, [block.rows[a].expression for a in members]), members))
+            groups.append((Running(self, order, [block.rows[a].expression for a in members]), members))
         for level in range(depth + 1):
             active = [(series, members) for series, members in groups if series.order <= level]
             self._move(block, level, rates and rates.advance)
@@ -231,7 +224,7 @@ class _Follow(Motion):
 
     def values(self, entries):
         """Values of SX scalars by the coefficients 0 of all jets."""
-        return self.running(self, 0, entries).advance()
+        return Running(self, 0, entries).advance()
 
 
 class Expressions(_Follow):

@@ -104,8 +104,10 @@ def _lowest(q, rows, numbers, context, starts=None, most=None):
     if most is not None and max(combined_uses([rows[a] for a in support]).values(), default=0) > most:
         raise Deep
     top = max(rows[a].order for a in support)
+    # The gradients of the others are divided by: constant ones vanish nowhere.
+    varying = {a for a in support if ca.symvar(rows[a].gradient(q))}
     highest = ((a, w) for a, w in zip(support, weights, strict=True) if rows[a].order == top)
-    b = max((rows[a].kind == "dynamics", w, a) for a, w in highest)[2]
+    b = max((rows[a].kind == "dynamics", varying <= {a}, w, a) for a, w in highest)[3]
     first = _combination(q, rows, b, support, numbers, context, starts)
     if first.row.order < top and not _slopes_beside(q, rows, first, context).any():
         return first

@@ -300,7 +300,8 @@ def sample(q, rows, level, context, starts=None, flow=None):
         shared = min(len(z), len(starts.z))
         for i in range(POINTS):
             again, p = divmod(i, len(starts))
-            t[i], z[:shared, i] = starts.instants[p], starts.z[:shared, p] + again * SPREAD * z[:shared, i]
+            t[i, : starts.instants.shape[1]] = starts.instants[p]  # references that were made later have random jets
+            z[:shared, i] = starts.z[:shared, p] + again * SPREAD * z[:shared, i]
     starting = Points(
         q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book, context.scales
     )

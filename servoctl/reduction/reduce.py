@@ -1,7 +1,7 @@
 """From a mechanism and a program to the rows that determine the motion and its actuation."""
 
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain
 
 import casadi as ca
@@ -14,7 +14,6 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.knots import Knots, Switches, require_smooth
 from servoctl.reduction.manifold import Context, Points, at_nominal_size, follows, sample
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
@@ -31,9 +30,7 @@ from servoctl.values import frozen
 
 NEARBY = 0.01  # s about an instant for which pivots are chosen; at that instant itself entries may vanish by accident
 NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
-WINDOW = (0.1, 1.1)  # s, where points are drawn if nothing switches; t = 0 is too often a special instant
-LONE_WINDOW = 1.0  # s on either side of a single switch
-INSET = 0.07  # fraction of the time from first to last switch left out at both ends, where paths are nearly at rest
+WINDOW = (0.1, 1.1)  # s, where points are drawn; t = 0 is too often a special instant of formulas of time
 WEAKER = 1e-6  # relative to its size before: a pivot below this with other parameters is chosen again
 HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
@@ -49,8 +46,6 @@ class Reduction(Packed):
     rank: Rank  # of the leading matrix of the rows, with its margins
     points: Points  # seeded points on the manifold of the rows and their derivatives
     pivots: tuple  # (str, SX): pivots by which the rows divide, each with a description
-    knots: Knots
-    switches: Switches
     context: Context
     original: dict  # rows of the designer's residuals and material constraints, by name
     cascade: Cascade | None = None  # the rows by blocks, where they are deep
@@ -75,16 +70,6 @@ class Reduction(Packed):
     def needs(self):
         """The highest derivative of each residual that the actuation contains."""
         return {name: count for name, count in needs(self.rows).items() if name in self.program.residuals}
-
-    @property
-    def smoothness(self):
-        """The class in time that each residual, material constraint and force needs."""
-        return smoothness(self.switches, self.rows)
-
-    @property
-    def timed(self):
-        """Whether paths switch at some instants."""
-        return bool(self.switches)
 
     @cached_property
     def references(self):
@@ -193,15 +178,6 @@ def needs(rows):
     return merge_uses(*((row.uses, max(0, 2 - row.order)) for row in rows))
 
 
-def smoothness(switches, rows):
-    """The class in time that each expression of the switches needs; an undifferentiated balance may jump."""
-    total = needs(rows)
-    forces = total.pop(Balance(), 0)
-    if forces:
-        total |= {name: forces for name in switches.residuals if isinstance(name, Balance)}
-    return total
-
-
 @np.errstate(all="ignore")  # trial values may leave the domain of the rows: what is not finite is no point
 def reduce(mechanism, program, guess=None, near=None, values=None):
     """Derive the rows of a motion: eq. (3.18), hidden constraints, ranks on the manifold.
@@ -213,28 +189,21 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     default those of the mechanism. For errors see `hidden.complete` and `realisation.realisation`.
     """
     program = require_parts(mechanism, program, guess)
-    q = mechanism.q
-    names = q.force_names
     balance = desired_balance(mechanism, program)
-    forces = dict(zip(map(Balance, names), balance.elements(), strict=True))
-    switches = Switches(q, {**program.residuals, **mechanism.constraints, **forces}, mechanism.parameters.symbols)
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
-    times = switches.times(values)
     plain, errors = guess is None if near else all(map(_ordinary, filter(None, (guess or {}).values()))), {}
     for scaled in (not plain,) if near else (not plain, plain):  # a guess far from the origin tells no size
-        scales = usual(mechanism, program, guess or {}, values, partial(_window, times)) if scaled else None
+        scales = usual(mechanism, program, guess or {}, values, _window) if scaled else None
         if errors and scaled and scales.ordinary:
             break
         try:
-            return _reduced(
-                mechanism, program, switches, balance, _context(mechanism, times, guess, near, values, scales)
-            )
+            return _reduced(mechanism, program, balance, _context(mechanism, guess, near, values, scales))
         except ServoError as error:
             errors[scaled] = error
     raise errors.get(True, errors.get(False))
 
 
-def _reduced(mechanism, program, switches, balance, context):
+def _reduced(mechanism, program, balance, context):
     """The reduction by points of a context."""
     q = mechanism.q
     original = [
@@ -250,13 +219,10 @@ def _reduced(mechanism, program, switches, balance, context):
     solve = complete if realised.settled else completed
     inertial = replace(context, saddle=saddle(mechanism, [row for row in constraints if row.kind == "material"]))
     rows, rank, points, of_rows, *cascade = solve(q, rows, inertial, points)
-    knots = require_smooth(switches, context.values, smoothness(switches, rows))
     of_split = [(f"choice of dependent coordinates {i}", pivot) for i, pivot in enumerate(of_split, 1)]
     pivots = (*of_constraints, *of_sharing, *of_split, *of_rows)
     by_name = {row.name: row for row in original}
-    return Reduction(
-        mechanism, program, tuple(rows), realised, rank, points, pivots, knots, switches, context, by_name, *cascade
-    )
+    return Reduction(mechanism, program, tuple(rows), realised, rank, points, pivots, context, by_name, *cascade)
 
 
 def references(mechanism, program, further=()):
@@ -385,24 +351,19 @@ def require_outputs(reduction):
             )
 
 
-def _context(mechanism, times, guess, near, values, scales=None):
+def _context(mechanism, guess, near, values, scales=None):
     symbols, unit = mechanism.parameters.symbols, 1.0 if scales is None else scales.time
     if near is None:
-        return Context(symbols, values, _window(times, unit), guess or {}, scales=scales)
+        return Context(symbols, values, _window(unit), guess or {}, scales=scales)
     t, guess, sizes = near
     width = NEARBY * min(unit, _time_scale(mechanism.q, guess, scales))
     followed = follows(mechanism.q, guess)
     return Context(symbols, values, (t - width, t + width), guess, NEAR_SPREAD, sizes, scales, followed)
 
 
-def _window(times, scale=1.0):
-    """The window (t0, t1) [s] in which points are drawn, from the instants of switches and a time scale [s]."""
-    if not times:
-        return WINDOW[0] * scale, WINDOW[1] * scale
-    if len(times) == 1:
-        return times[0] - LONE_WINDOW * scale, times[0] + LONE_WINDOW * scale
-    width = times[-1] - times[0]
-    return times[0] + INSET * width, times[-1] - INSET * width
+def _window(scale):
+    """The window (t0, t1) [s] in which points are drawn, from a time scale [s]."""
+    return WINDOW[0] * scale, WINDOW[1] * scale
 
 
 def _ordinary(size):

@@ -13,7 +13,8 @@ from servoctl.errors import SpecificationError, UnstableInternalDynamics
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import Bounded
 from servoctl.methods.radau import basis
-from servoctl.sensitivities.tangent import invariants_by, kept, parameter_symbols, start_of
+from servoctl.model.following import moved_by, p_with_rates
+from servoctl.sensitivities.tangent import by_parameters, invariants_by, kept, start_of
 from servoctl.tolerances import CUTOFF
 
 SAME_MOTION = 1e-3  # of its size: a run that differs by more is not the bounded motion of its program
@@ -68,12 +69,14 @@ class _Linear:
     """A (N, f, f) and b (N, f, k) at states, and ∂x/∂p (N, n_x, k) with the free entries held."""
 
     def __init__(self, problem, names, t, x):
-        n_x, m, k, p = problem.n_x, problem.m, len(names), problem.p
+        n_x, m, k, model = problem.n_x, problem.m, len(names), problem.model
+        moved = moved_by(model, names)
+        p = p_with_rates(model, moved)
         _, self.A, _, self.tangent = problem.local(t, x)
-        y = invariants_by(problem.model, names).grid(t, x, p)[m:].T.reshape(len(t), n_x + k, m).swapaxes(1, 2)
+        y = invariants_by(model, names, moved).grid(t, x, p)[m:].T.reshape(len(t), n_x + k, m).swapaxes(1, 2)
         self.held = np.zeros((len(t), n_x, k))
         self.held[:, problem.solved] = -np.linalg.solve(y[:, :, problem.solved], y[:, :, n_x:])
-        slopes = _rates_by(problem.model, names).grid(t, x, p).T.reshape(len(t), n_x + k, n_x).swapaxes(1, 2)
+        slopes = _rates_by(model, names, moved).grid(t, x, p).T.reshape(len(t), n_x + k, n_x).swapaxes(1, 2)
         self.b = (slopes[:, :, :n_x] @ self.held + slopes[:, :, n_x:])[:, problem.free]
 
     def lifted(self, dz):
@@ -82,10 +85,10 @@ class _Linear:
 
 
 @kept
-def _rates_by(model, names):
+def _rates_by(model, names, moved):
     """∂X'/∂X and ∂X'/∂p, column by column, as a function of (t, X, p)."""
     e = model.equations
     rates = e.called(e.ode(), e.state, e.parameters)[: e.state.numel()]
-    both = ca.vertcat(e.state, parameter_symbols(e, names))
-    f = e.function("rates_by", e.state, [ca.vec(ca.densify(ca.jacobian(rates, both)))])
+    slopes = ca.horzcat(ca.jacobian(rates, e.state), by_parameters(e, rates, names, moved))
+    f = e.function("rates_by", e.state, [ca.vec(ca.densify(slopes))], rates=moved)
     return compiled(f, "rates_by", ("rk",))  # which is evaluated at many points, and therefore compiled

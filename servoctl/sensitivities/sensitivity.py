@@ -13,7 +13,7 @@ from servoctl.methods.choice import Bounded
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.equations import invariant_names, signal_groups
-from servoctl.model.model import knots_within
+from servoctl.model.following import instant_by, moved_by, p_with_rates
 from servoctl.model.switching import switching
 from servoctl.run import STENCIL, ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
@@ -25,7 +25,6 @@ STIFF = ("Radau", "RadauIIA")  # methods of runs whose variational equation is s
 DEPENDS = 1e-8  # of a column of the invariants' Jacobian: what is left after others, below which it depends on them
 BESIDE_KNOT = 1e-9  # of the span: instants before and after a knot at which rates are compared
 JUMPS = 1e-6  # of the rates: a larger difference there is a jump
-SHIFT = 1e-4  # of a parameter, by which the instants of knots are differentiated
 
 
 @frozen(eq=False)
@@ -227,9 +226,10 @@ def _tangents(run, S, names, initial, kinds):
     """Tangents (rows, K, N) of jets and signals at the samples, from those S (n_x, K, N) of the state."""
     parts, K = [], len(names) + len(initial)
     for first, end, model in run.variants or ((0, len(run.t), run.model),):
-        f, t = tangent_at(model, names, len(initial), kinds), run.t[first:end]
+        moved, t = moved_by(model, names), run.t[first:end]
+        f, p = tangent_at(model, names, moved, len(initial), kinds), p_with_rates(model, moved)
         of_state = S[:, :, first:end].swapaxes(0, 1).reshape(-1, len(t))
-        y = f.grid(t, np.concatenate([run.jets[: len(model.jet_names), first:end], of_state]), model.p)
+        y = f.grid(t, np.concatenate([run.jets[: len(model.jet_names), first:end], of_state]), p)
         sizes = [len(model.jet_names), *(len(model.signals(kind)[0]) for kind in kinds)]
         blocks = zip(np.split(y, np.cumsum(sizes[:-1]) * K), sizes, strict=True)
         parts.append(np.concatenate([block.reshape(K, size, -1).swapaxes(0, 1) for block, size in blocks]))
@@ -256,7 +256,8 @@ def _tangent_at_start(run, names, initial):
     model = run.variant(0)
     t, x = start_of(run)
     m, n_x = len(invariant_names(model)), len(x)
-    y = invariants_by(model, names)(t, x, model.p)
+    moved = moved_by(model, names)
+    y = invariants_by(model, names, moved)(t, x, p_with_rates(model, moved))
     G = y[m:].reshape(n_x + len(names), m).T
     G, by_parameters = G[:, :n_x], G[:, n_x:]
     held = run.start.held if run.start is not None else ()
@@ -317,10 +318,11 @@ def _integrated(model, run, names, S):
         if k:
             y[n_x:] += _shifted(model, run, names, a, y[:n_x], K).T.ravel()
         variant = _variant_at(run, a, b)
-        f = variational(variant, names, K - len(names))
+        moved = moved_by(variant, names)
+        f, p = variational(variant, names, moved, K - len(names)), p_with_rates(variant, moved)
         inside = np.flatnonzero((forward * run.t >= forward * a) & (forward * run.t <= forward * b))
         solved = solve_ivp(
-            lambda t, z, f=f, p=variant.p: f(t, z, p),
+            lambda t, z, f=f, p=p: f(t, z, p),
             (a, b),
             y,
             method,
@@ -369,18 +371,8 @@ def _shifted(model, run, names, t, x, columns):
     jump = np.zeros((len(x), columns))
     if np.abs(after - before).max() > JUMPS * np.abs(sides).max():
         for j, name in enumerate(names):
-            jump[:, j] = (before - after) * _knot_rate(model, run, name, t)
+            jump[:, j] = (before - after) * (instant_by(model, name, t) or 0.0)
     return jump
-
-
-def _knot_rate(model, run, name, t):
-    """Derivative of the instant of a knot by a parameter."""
-    value, ends = model.numbers[name], (start_of(run)[0], float(run.t[-1]))
-    span = min(ends), max(ends)
-    shift = SHIFT * (abs(value) or 1.0)
-    knots = [np.array(knots_within(model.with_parameters(**{name: value + h}), span)) for h in (-shift, shift)]
-    nearest = [k[np.argmin(np.abs(k - t))] if len(k) else np.nan for k in knots]
-    return (nearest[1] - nearest[0]) / (2 * shift)
 
 
 # --- between samples --------------------------------------------------------------------------------------------------

@@ -18,12 +18,27 @@ import numpy as np
 from servoctl.codegen.function import compiled
 from servoctl.model.equations import SIGNALS
 from servoctl.reduction.ranks import clean, eliminate
+from servoctl.spec.references import Jets
 
 
 def parameter_symbols(equations, names):
     """The symbols (k,) of parameters by name."""
     parameters = equations.r.mechanism.parameters
     return ca.vertcat(ca.SX(0, 1), *(parameters.symbols[parameters.names.index(name)] for name in names))
+
+
+def by_parameters(equations, expressions, names, moved):
+    """Derivatives (m, k) of expressions (m,) by parameters by name, also along the references that move with them.
+
+    `moved` are the pairs (reference, parameter) of these, whose derivatives have jets of their own.
+    """
+    slopes = ca.jacobian(expressions, parameter_symbols(equations, names))
+    if not moved:
+        return slopes
+    jets, symbol = Jets(equations.q, [expressions]), equations.q.family.jet
+    rows = [[symbol((r, name), k) if (r, name) in moved else 0 for name in names] for r, k in jets.places]
+    rates = ca.vertcat(ca.SX(0, len(names)), *(ca.horzcat(*row) for row in rows))
+    return slopes + ca.jacobian(expressions, jets.symbols) @ rates
 
 
 def start_of(run):
@@ -38,10 +53,11 @@ class Tangent:
 
     `S` (n_x, K) is the tangent of the state, its first k columns by the k parameters `names`, the others by initial
     values; by default it is what the program determines. `jets` (n_z, K) is ∂Z with the same columns.
+    References that move with the parameters are those of the pairs `moved`.
     """
 
-    def __init__(self, equations, names, S=None):
-        self.e, self.symbols = equations, parameter_symbols(equations, names)
+    def __init__(self, equations, names, moved, S=None):
+        self.e, self.names, self.moved = equations, names, moved
         sizes = [equations.q.nq, *[equations.q.n] * (equations.top - 1)]
         known = [] if S is None else ca.vertsplit(S, np.cumsum([0, *sizes]).tolist())
         for j in range(len(known), equations.top + 1):
@@ -61,12 +77,10 @@ class Tangent:
 
     def along(self, expressions, jets, tangents):
         """The derivatives (m, K) of expressions (m,) along tangents of jets, and by the parameters."""
-        columns = tangents[0].shape[1] if tangents else self.symbols.numel()
-        by_parameters = ca.horzcat(
-            ca.SX.eye(self.symbols.numel()), ca.SX.zeros(self.symbols.numel(), columns - self.symbols.numel())
-        )
-        result = ca.SX.zeros(expressions.numel(), columns)
-        for symbols, tangent in [*zip(jets, tangents, strict=True), (self.symbols, by_parameters)]:
+        k, slopes = len(self.names), by_parameters(self.e, expressions, self.names, self.moved)
+        columns = tangents[0].shape[1] if tangents else k
+        result = ca.horzcat(slopes, ca.SX.zeros(expressions.numel(), columns - k))
+        for symbols, tangent in zip(jets, tangents, strict=True):
             if symbols.numel():
                 result += ca.jacobian(expressions, symbols) @ tangent
         return result
@@ -87,7 +101,7 @@ def kept(build):
 
 
 @kept
-def tangent_at(model, names, initial, kinds):
+def tangent_at(model, names, moved, initial, kinds):
     """The compiled tangent of jets and groups of signals at a state and its tangent S: a function of t, (Z, S), p.
 
     The columns of S are by the parameters `names`, then by `initial` initial values; a flat model has no S. Outputs
@@ -95,30 +109,31 @@ def tangent_at(model, names, initial, kinds):
     """
     e = model.equations
     S = ca.SX(0, 0) if model.flat else ca.SX.sym("S", e.state.numel(), len(names) + initial)
-    tangent = Tangent(e, names, None if model.flat else S)
+    tangent = Tangent(e, names, moved, None if model.flat else S)
     parts = [tangent.jets, *(tangent.of(ca.vertcat(*SIGNALS[kind](e)[1])) for kind in kinds)]
-    f = e.function("tangent", ca.vertcat(e.jets, ca.vec(S)), [ca.vec(ca.densify(part)) for part in parts])
+    x, outputs = ca.vertcat(e.jets, ca.vec(S)), [ca.vec(ca.densify(part)) for part in parts]
+    f = e.function("tangent", x, outputs, rates=moved)
     return compiled(f, "tangent", ("rk",) if model.flat else ())  # all its samples at once are worth compiling
 
 
 @kept
-def variational(model, names, initial):
+def variational(model, names, moved, initial):
     """X' and S' as a function of t, (X, S), p: the equations of motion with their variational equations."""
     e = model.equations
     S = ca.SX.sym("S", e.state.numel(), len(names) + initial)
-    tangent, top = Tangent(e, names, S), ca.vertcat(*e.q.gamma(e.top))
+    tangent, top = Tangent(e, names, moved, S), ca.vertcat(*e.q.gamma(e.top))
     rates = e.rates(top)
     state_rates = e.called(e.ode(), e.state, e.parameters)[: e.state.numel()]
     tangent_rates = ca.substitute(tangent.of(rates), top, state_rates[-e.q.n :])
-    x = ca.vertcat(e.state, ca.vec(S))
-    return compiled(e.function("variational", x, [state_rates, ca.vec(ca.densify(tangent_rates))]), "variational")
+    x, outputs = ca.vertcat(e.state, ca.vec(S)), [state_rates, ca.vec(ca.densify(tangent_rates))]
+    return compiled(e.function("variational", x, outputs, rates=moved), "variational")
 
 
 @kept
-def invariants_by(model, names):
+def invariants_by(model, names, moved):
     """The invariants of the state, and their Jacobian in X and in parameters, as a function of (t, X, p)."""
     e = model.equations
     values = ca.vertcat(ca.SX(0, 1), *(expression for _, _, expression in e.invariant_rows))
-    both = ca.vertcat(e.state, parameter_symbols(e, names))
-    slopes = ca.vec(ca.densify(ca.jacobian(values, both)))
-    return compiled(e.function("invariants_by", e.state, [values, slopes]), "invariants_by")
+    slopes = ca.horzcat(ca.jacobian(values, e.state), by_parameters(e, values, names, moved))
+    outputs = [values, ca.vec(ca.densify(slopes))]
+    return compiled(e.function("invariants_by", e.state, outputs, rates=moved), "invariants_by")

@@ -9,7 +9,7 @@ import numpy as np
 
 from servoctl.checks import by_name, column, distinct, interval, mapping, named, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
-from servoctl.jets.branches import as_text, cse
+from servoctl.jets.branches import Branches, as_text, cse
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
@@ -662,9 +662,28 @@ def inverse_directions(E):
     return ca.DM(np.linalg.inv(numbers)) if np.linalg.matrix_rank(numbers) == len(numbers) else None
 
 
+def _require_no_switch(expression, q, what):
+    """Refuse an operation with branches that the time alone decides: what comes from data has its instants, too."""
+    if not ca.depends_on(expression, q.t):
+        return
+    branches = Branches(lambda symbol: q.where(symbol) == q.where(q.t))
+    branches.smooth(ca.SX(expression).elements())
+    for switch in branches.switches:
+        if not any(map(q.is_jet, ca.symvar(switch.function))):
+            raise SpecificationError(
+                f"{what[0].upper()}{what[1:]} switches with the time alone, where {switch.text}.",
+                "Formulas of q.t are smooth; a signal that switches is a path, which knows its instants.",
+                do="Write r = q.references(r=first.then(second)).r with paths of sv.paths in place of "
+                "if_else(q.t < ..., ...), or sv.paths.polynomials(breaks, coefficients) in place of fmin and fmax.",
+                what=what,
+                switch=switch.text,
+            )
+
+
 def require_known(expression, mechanism, what):
-    """Refuse a symbol that is no coordinate, jet, parameter or t of the mechanism."""
+    """Refuse a symbol that is no coordinate, jet, parameter or t of the mechanism, and a switch in t alone."""
     q, known = mechanism.q, {s.element_hash() for s in mechanism.parameters.symbols}
+    _require_no_switch(expression, q, what)
     for s in ca.symvar(expression):
         if q.where(s) is None and s.element_hash() not in known:
             if (error := mechanism.no("symbol", s.name(), ())).details.get("left_out"):

@@ -9,6 +9,7 @@ import numpy as np
 from servoctl.checks import by_name, named, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, column_of
+from servoctl.spec.paths.parametric import ParametricPath, parameters_of, path_at
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import Path
 
@@ -93,12 +94,14 @@ class Family:
         return References(self, paths)
 
     def jet(self, name, k):
-        """The symbol of the k-th derivative."""
+        """The symbol of the k-th derivative of a reference, or of its derivative by a parameter: (name, parameter)."""
         if (name, k) not in self._symbols:
             with _lock:  # threads that derive from one mechanism share its symbols
                 if (name, k) not in self._symbols:
-                    symbol = ca.SX.sym(name if k == 0 else f"d{name}" if k == 1 else f"d{k}{name}")
-                    self._places[symbol.element_hash()] = ("r", k, self.names.index(name))
+                    written = name if isinstance(name, str) else "_by_".join(name)
+                    symbol = ca.SX.sym(written if k == 0 else f"d{written}" if k == 1 else f"d{k}{written}")
+                    place = self.names.index(name) if name in self.paths else name
+                    self._places[symbol.element_hash()] = ("r", k, place)
                     self._symbols[name, k] = symbol
         return self._symbols[name, k]
 
@@ -139,16 +142,18 @@ def called(q, names, f, x, p):
 class Jets:
     """The jets of references in expressions as further numbers of a column, whose values follow from paths by name.
 
-    `places` are their names and orders, `symbols` and `rates`, the next jets, SX columns.
+    `places` are their names and orders, `symbols` and `rates`, the next jets, SX columns. `numbers` are parameters and
+    their values (n_p,), which paths may contain.
     """
 
-    def __init__(self, q, expressions, paths=None):
+    def __init__(self, q, expressions, paths=None, numbers=None):
         symbols = ca.symvar(ca.vertcat(ca.SX(0, 1), *map(ca.vec, expressions)))
         found = [(place, s) for s in symbols if (place := q.where(s)) and place[0] == "r"]
         self.symbols = ca.vertcat(ca.SX(0, 1), *(s for _, s in found))
         self._names, self.places = q.family.names, [(q.family.names[i], k) for (_, k, i), _ in found]
         self.rates = ca.vertcat(ca.SX(0, 1), *(q.family.jet(name, k + 1) for name, k in self.places))
-        self._paths = paths and required_paths({name: paths[name] for name, _ in self.places})
+        self.paths = paths and required_paths({name: paths[name] for name, _ in self.places})
+        self.paths = paths_at(self.paths, *numbers) if numbers else self.paths
 
     def __len__(self):
         return len(self.places)
@@ -165,7 +170,7 @@ class Jets:
     def at(self, t):
         """Their values at times (N,) [s], (n, N); a path that says nothing of an instant is held there."""
         highest = {name: k for k, name in sorted((k, name) for name, k in self.places)}
-        jets = {name: self._paths[name].held().jets(t, k) for name, k in highest.items()}
+        jets = {name: self.paths[name].held().jets(t, k) for name, k in highest.items()}
         return np.concatenate([np.zeros((0, len(t))), *(jets[name][k] for name, k in self.places)])
 
 
@@ -187,9 +192,39 @@ def other_paths(paths, changes):
     return paths | {name: followed_path(name, path) for name, path in changes.items()}
 
 
+def paths_at(paths, parameters, values):
+    """The paths by name with the values (n_p,) of parameters that they contain."""
+    written = {s.name(): float(value) for s, value in zip(parameters.symbols, values, strict=False)}
+    for name, path in paths.items():
+        if unknown_ones := [one for one in parameters_of(path) if one not in written]:
+            raise SpecificationError(
+                f"The path of the reference {name!r} contains {', '.join(unknown_ones)}.",
+                "A path contains numbers and parameters of the mechanism.",
+                nearest=f"Its parameters are {', '.join(written)}." if written else "",
+                do=f"Make the mechanism with parameters=sv.parameters({unknown_ones[0]}=..., ...).",
+                name=name,
+                names=unknown_ones,
+            )
+    return {name: path_at(path, written) for name, path in paths.items()}
+
+
+def require_fixed(paths, parameters, names, what):
+    """Refuse parameters by name which paths contain where they are changed along the same paths by `what`."""
+    written = {s.name(): name for name, s in zip(parameters.names, parameters.symbols, strict=True) if name in names}
+    for reference, path in paths.items():
+        if both := [name for one, name in written.items() if one in parameters_of(path)]:
+            raise SpecificationError(
+                f"The path of the reference {reference!r} contains {', '.join(both)}.",
+                f"{what} parameters along paths that stay the same.",
+                do=f"Follow a path of numbers: with_references({reference}=path.at({both[0]}=...)).",
+                name=reference,
+                names=both,
+            )
+
+
 def followed_path(name, path):
     """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
-    path = path if path is None or isinstance(path, Path) else as_path(path)
+    path = path if path is None or isinstance(path, (Path, ParametricPath)) else as_path(path)
     if path is not None and path.dim != 1:
         raise SpecificationError(
             f"The path of the reference {name!r} has {path.dim} components.",

@@ -1,9 +1,16 @@
-"""Paths of rotations: matrices R(s) from a body's axes to the world's, of the class of their argument.
+"""Rotations: matrices R from a body's axes to the world's, along an expression, and of measured ones a vector each.
 
-With a time law from `servoctl.paths` as the argument they are orientations to be programmed::
+An orientation to be programmed is geometry along a scalar reference::
 
-    s = sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=2.0)
+    (s,) = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0))
     rotation = sv.rotations.slerp(s, start, end)
+
+or, through many rotations, three references, the components of vectors about the middle one::
+
+    vectors, middle = sv.rotations.vectors(rotations)
+    path = sv.paths.spline(times, vectors, smoothness=3)
+    r = q.references(rx=path[0], ry=path[1], rz=path[2])
+    rotation = middle @ sv.rotations.from_vector([*r])
 """
 
 import casadi as ca
@@ -11,7 +18,6 @@ import numpy as np
 
 from servoctl.checks import array_of, column, matrix
 from servoctl.errors import SpecificationError
-from servoctl.spec import paths
 
 ORTHONORMAL = 1e-9  # largest difference of RᵀR from the identity
 HALF_TURN = 1e-6  # [rad] nearness to half a turn, where the shorter way is not determined
@@ -23,7 +29,7 @@ def turn(angle, axis, start=None):
     Parameters
     ----------
     angle : SX or float
-        [rad], of the class of the path.
+        [rad], of the class of the reference that drives it.
     axis : (3,) sequence of float
         The axis; its length plays no part.
     start : (3, 3) array or SX, optional
@@ -51,7 +57,7 @@ def slerp(s, start, end):
     Parameters
     ----------
     s : SX or float
-        Time law, 0 at the start and 1 at the end; the turn goes on outside.
+        0 at the start and 1 at the end, as of a reference; the turn goes on outside.
     start, end : (3, 3) arrays
         The rotations.
 
@@ -70,41 +76,33 @@ def slerp(s, start, end):
     return ca.SX(ca.DM(start)) @ _about(axis, s * angle)
 
 
-def spline(t, times, rotations, smoothness=2, ends="rest"):
-    """Pass through measured rotations at given times.
-
-    The vectors 2 tan(angle/2) along the axes, relative to the middle rotation, are a spline of `paths.spline`.
+def vectors(rotations):
+    """The vectors of rotations about the middle one, of which a path is made, by `paths.spline` or `paths.fit`.
 
     Parameters
     ----------
-    t : SX or float
-        Time [s], or a time law.
-    times : (n,) array
-        Strictly increasing [s].
     rotations : (n, 3, 3) array
-    smoothness : int, optional
-        Class k >= 0 of the path.
-    ends : {"rest", "natural"}, optional
-        As those of `paths.spline`.
 
     Returns
     -------
-    (3, 3) SX
+    vectors : (n, 3) array
+        Those of `from_vector`: the rotations are middle @ from_vector(vectors[i]).
+    middle : (3, 3) DM
+        The rotation in the middle of the list.
 
     Raises
     ------
     SpecificationError
-        If one is no rotation, or is half a turn or more from the middle one.
+        If there is none, one is no rotation, or is half a turn from the middle one.
     """
     rotations = [_matrix_of_numbers(rotation, f"rotations[{i}]") for i, rotation in enumerate(rotations)]
     if not rotations:
-        raise SpecificationError("No rotation is given.", "A spline passes through two at least.")
-    middle = rotations[len(rotations) // 2]
-    vectors = []
+        raise SpecificationError("No rotation is given.", "A path passes through two at least.")
+    middle, found = rotations[len(rotations) // 2], []
     for i, rotation in enumerate(rotations):
         axis, angle = _axis_and_angle(middle.T @ rotation, f"rotations[{i}] and the middle one")
-        vectors.append(2.0 * np.tan(angle / 2.0) * axis)
-    return ca.SX(ca.DM(middle)) @ from_vector(paths.spline(t, times, np.array(vectors), smoothness, ends))
+        found.append(2.0 * np.tan(angle / 2.0) * axis)
+    return np.array(found), ca.DM(middle)
 
 
 def from_vector(vector):

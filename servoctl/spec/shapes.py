@@ -124,7 +124,7 @@ def moved(mechanism, t, q, p, paths=None):
 
     References without a path among them follow the default ones.
     """
-    jets = _jets_along(mechanism, mechanism.shapes.values(), paths)
+    jets = _jets_along(mechanism, mechanism.shapes.values(), paths, p)
     values = np.array(_points_of(Identity(mechanism))(np.reshape(t, (1, -1)), q, p, jets.at(t)))
     ends = np.cumsum([points.numel() for points in mechanism.shapes.values()])
     rows = np.split(values, ends[:-1])
@@ -139,12 +139,12 @@ def _points_of(identity):
     mechanism = identity.value
     q, p = mechanism.q, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)
     points = ca.vertcat(*(ca.vec(points) for points in mechanism.shapes.values()))
-    jets = _jets_along(mechanism, mechanism.shapes.values()).symbols
+    jets = Jets(q, mechanism.shapes.values()).symbols
     return ca.Function("shapes", [q.t, ca.vertcat(*q), p, jets], [ca.densify(points)])
 
 
-def _jets_along(mechanism, expressions, paths=None):
-    return Jets(mechanism.q, expressions, mechanism.q.family.paths | (paths or {}))
+def _jets_along(mechanism, expressions, paths, p):
+    return Jets(mechanism.q, expressions, mechanism.q.family.paths | (paths or {}), (mechanism.parameters, p))
 
 
 def heights(mechanism, names, t, q, p, paths=None):
@@ -160,7 +160,7 @@ def heights(mechanism, names, t, q, p, paths=None):
     system = mechanism.q
     rates = ca.vertcat(*system.gamma(1), *system.gamma(2))
     slopes = ca.jacobian(ca.vertcat(*(own[name] for name in names)), ca.vertcat(*system)) @ system.V
-    jets = _jets_along(mechanism, [mechanism.balance, slopes], paths)
+    jets = _jets_along(mechanism, [mechanism.balance, slopes], paths, p)
     parameters = ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)
     symbols = [system.t, ca.vertcat(*system), rates, parameters, jets.symbols]
     p = np.asarray(p)[: len(mechanism.parameters.names)]

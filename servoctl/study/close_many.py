@@ -18,6 +18,7 @@ from servoctl.control.residuals import Residuals
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
+from servoctl.spec.references import require_fixed
 from servoctl.study.batch import Batch, failure, of_finished
 from servoctl.study.cases import CASES, as_columns
 from servoctl.study.executor import computed, whole_run
@@ -216,6 +217,7 @@ def _case_numbers(run, columns, scale):
                 name=name,
             )
         if name in parameters:
+            require_fixed(plant.paths, plant.mechanism.parameters, [name], "Cases of a loop have their own")
             constants[parameters.index(name)] = values
         elif name in plant.state_names:
             starts[plant.state_names.index(name)] = values

@@ -11,7 +11,7 @@ from servoctl.methods.accuracy import component_sizes, relative_error
 from servoctl.methods.choice import Adaptive, Algebraic, Project, Taylor
 from servoctl.methods.sizes import state_levels
 from servoctl.model.equations import signal_groups
-from servoctl.model.model import knots_within
+from servoctl.model.following import breaks_within
 from servoctl.simulation import consistent_state, simulated
 from servoctl.study.executor import whole_run
 from servoctl.verification import verify
@@ -31,7 +31,7 @@ class Converged:
         consistent_state(model, start, span[0])
         self.model, self.start, self.span, self._runs = model, start, span, {}
         t0, t1 = span
-        self.knots = [k for k in knots_within(model, span) if min(span) < k < max(span)]
+        self.knots = [k for k in breaks_within(model, span) if min(span) < k < max(span)]
         self.few = np.union1d(np.linspace(t0, t1, INSTANTS), self.knots)
         between = t0 + (t1 - t0) * (np.arange(COMPARED) + BETWEEN) / COMPARED
         self.times = np.unique([t0, *between, t1, *self.knots])

@@ -14,16 +14,17 @@ from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
-from servoctl.model.following import places_of
-from servoctl.model.model import Model, including, knots_within
+from servoctl.model.following import breaks_within, moved_by, places_of
+from servoctl.model.model import Model, including
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
 from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
+from servoctl.spec.paths.parametric import PathAt
 from servoctl.spec.paths.value import Path
-from servoctl.spec.references import followed_path
+from servoctl.spec.references import followed_path, paths_at
 from servoctl.study.batch import FINAL, Batch, failure, of_finished
 from servoctl.study.cases import as_columns
 from servoctl.study.executor import computed, require_some, whole_run
@@ -115,7 +116,7 @@ def simulate_many(
 def _share_computed(part, span, method, times):
     """A part of the cases with its results, computed by a worker."""
     part.compute(span, method, times, 1, lambda count: None)
-    part.models, part.followers = {}, None
+    part.models, part.followers = {}, {}
     return part
 
 
@@ -164,7 +165,9 @@ class _Many:
 
     def __init__(self, model, n, columns, paths, starts, n_times):
         self.model, self.n, self.columns, self.starts, self.models = model, n, columns, starts, {}
-        self.paths, self.followers, self.knots = paths, None, []
+        moved = {r for r, _ in moved_by(model, columns)} - paths.keys()
+        self.paths = paths | {name: [model.paths[name].source] * n for name in model.paths if name in moved}
+        self.followers, self.knots = {}, []
         self.interrupted, n_x = False, len(model.state_names)
         self.done, self.steps, self.errors, self.runs = np.zeros(n, bool), np.full(n, np.nan), {}, {}
         self.parameters = np.tile(model.parameters, (n, 1))
@@ -179,15 +182,22 @@ class _Many:
         return self.models[key].with_references(**self.paths_of(i)) if self.paths else self.models[key]
 
     def paths_of(self, i):
-        """The paths of a case."""
-        return {name: column[i] for name, column in self.paths.items()}
+        """The paths of a case, with its parameters, as paths of numbers."""
+        case = {name: plain(column[i]) for name, column in self.columns.items()}
+        paths, known = (
+            {name: column[i] for name, column in self.paths.items()},
+            self.model.reduction.mechanism.parameters,
+        )
+        paths = paths_at(paths, known, known.values(self.model.numbers | case))
+        return {name: path._with() if isinstance(path, PathAt) else path for name, path in paths.items()}
 
     def along(self, which):
         """The models that follow the paths of some cases, with the parameters of the model: made once, and kept."""
         if not self.paths:
             return [self.model] * len(which)
-        if self.followers is None:
-            self.followers = [self.model.with_references(**self.paths_of(i)) for i in range(self.n)]
+        for i in which:
+            if i not in self.followers:
+                self.followers[i] = self.model.with_references(**self.paths_of(i))
         return [self.followers[i] for i in which]
 
     def numbers(self, which, p):
@@ -262,7 +272,7 @@ class _Many:
     def plans(self, span, times, threads, progress):
         """Compute the plans whose pivots do not fall."""
         which, x0, p = self._prepared(span)
-        groups = {} if self.paths else {knots_within(self.model, (min(span), max(span))): range(len(which))}
+        groups = {} if self.paths else {breaks_within(self.model, span): range(len(which))}
         for k, i in enumerate(which.tolist() if self.paths else ()):
             groups.setdefault(self.knots[i], []).append(k)
         for knots, some in groups.items():
@@ -280,8 +290,7 @@ class _Many:
 
     def _prepared(self, span):
         """Cases (K,) for which the derivation and its knots hold, their states (K, n_x) and parameters (K, n_p)."""
-        t, span = span[0], (min(span), max(span))
-        knots = () if self.paths else knots_within(self.model, span)
+        t, knots = span[0], () if self.paths else breaks_within(self.model, span)
         p, x = self.parameters, np.empty((self.n, len(self.model.state_names)))
         ready = self._affirmed(p)
         try:
@@ -291,7 +300,7 @@ class _Many:
         for i in np.flatnonzero(~ready).tolist():
             with contextlib.suppress(ServoError):
                 model = self.model_of(i)
-                if model.reduction is self.model.reduction and (self.paths or knots_within(model, span) == knots):
+                if model.reduction is self.model.reduction and (self.paths or breaks_within(model, span) == knots):
                     x[i], p[i] = as_state(model, self.start(i, model, t), t), model.parameters
                     ready[i] = True
         ready &= self._smooth(span) if self.paths else True
@@ -300,11 +309,10 @@ class _Many:
 
     def _smooth(self, span):
         """Cases (N,) whose paths are smooth enough within a span, whose knots are kept; other cases become errors."""
-        models, smooth = self.along(range(self.n)), np.ones(self.n, bool)
-        self.knots = [()] * self.n
-        for i, model in enumerate(models):
+        smooth, self.knots = np.ones(self.n, bool), [()] * self.n
+        for i in range(self.n):
             try:
-                self.knots[i] = knots_within(model, span)
+                self.knots[i] = breaks_within(*self.along([i]), span)
             except ServoError:
                 smooth[i] = False
         return smooth
@@ -327,17 +335,14 @@ class _Many:
 
     def _affirmed(self, p):
         """Cases (N,) for which double precision affirms the derivation; their parameters p (N, n_p) are set."""
-        names, of_knots = list(self.model.numbers), self.model.reduction.switches.numbers
+        names = list(self.model.numbers)
         if not self.columns.keys() <= set(names):
             return np.zeros(self.n, bool)
         if not self.columns:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
-        affirmed = affirmed_each(self.model, p.T.copy())
-        if len(of_knots):
-            affirmed &= (p[:, of_knots] == self.model.parameters[of_knots]).all(axis=1)
-        return affirmed
+        return affirmed_each(self.model, p.T.copy())
 
     def _tolerances_fit(self, span, cases, largest, method):
         """Whether motions with magnitudes (n_x, N) need no tolerances of their own, as `simulate` decides it."""
@@ -383,4 +388,5 @@ class _Many:
         places = {i: k for k, i in enumerate(which.tolist())} if self.runs else {}
         runs = {places[i]: run for i, run in self.runs.items() if i in places}
         states, p = self.samples[which].transpose(2, 1, 0), self.parameters[which].T
-        return Signals(self.along(which), self.model, t, count, states, p, level, runs)
+        models = [self.model if i in self.errors else self.along([i])[0] for i in which.tolist()]
+        return Signals(models, self.model, t, count, states, p, level, runs)

@@ -56,7 +56,8 @@ def scene():
     mechanism = point()
     q = mechanism.q
     x, y = q
-    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 1.0, duration=1.0), "Y": y})
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 1.0, duration=1.0))
+    program = sv.Program({"X": x - r.X, "Y": y})
     model = sv.derive(mechanism, program)
     plan = sv.simulate(model, model.start(), (0.0, 1.0), t_eval=np.linspace(0.0, 1.0, 101))
     ideal = sv.derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}, by="ideal"))
@@ -79,6 +80,7 @@ def calls():
     (_, y), t = q, q.t
     span, x0, near, folder = (0.0, 0.2), plan.state(0.0), s["ideal"].start(y=0.1, dy=0.0), s["folder"]
     noise, bounded = {"x": 1e-3}, sv.plant(s["mechanism"], limits={"pull": 50.0})
+    path = sv.paths.rest_to_rest(0.0, 1.0, duration=1.0)
     return {
         "simulate": (sv.simulate, dict(model=s["ideal"], start=near, t_span=span, method="RK4", drift="project",
                                        accuracy=None, t_eval=[0.0, 0.1], progress=False)),
@@ -130,7 +132,7 @@ def calls():
         "limit_report": (sv.limit_report, dict(run=sv.close(bounded, sv.limited(law, bounded), x0, span), scene=None)),
         "fastest": (sv.fastest, dict(mechanism=s["mechanism"], program=s["program"], limits={"pull": 50.0}, t_span=(0.0, 1.0),
                                      start=None, guess=None, parameters=None, shape=False)),
-        "slowed": (s["program"].slowed, dict(q=q, factor=2.0, at=0.0)),
+        "slowed": (sv.Program({"Y": y - ca.sin(t)}).slowed, dict(q=q, factor=2.0, at=0.0)),
         "grid": (lambda a: sv.grid(a=a), dict(a=[1.0, 2.0])),
         "monte_carlo": (lambda n, seed, a: sv.monte_carlo(n, seed=seed, a=a), dict(n=3, seed=1, a=stats.uniform(1.0, 2.0))),
         "sweep": (sv.sweep, dict(case=doubled, cases=[{"a": 1.0}], executor=None, seed=None, progress=False)),
@@ -162,13 +164,28 @@ def calls():
         "map.radius": (s["map"].radius, dict(method="RK4", step=0.1, drift=None, order=None)),
         "map.largest_step": (s["map"].largest_step, dict(method="RK4", drift=0.1, order=None)),
         "map.plot": (s["map"].plot, dict(method="RK4", poles=None)),
-        "paths.rest_to_rest": (sv.paths.rest_to_rest, dict(t=t, start=0.0, end=1.0, duration=1.0, smoothness=4,
-                                                           t_start=0.0)),
-        "paths.line": (sv.paths.line, dict(s=t, start=(0.0, 0.0), end=(1.0, 1.0))),
-        "paths.circle": (sv.paths.circle, dict(angle=t, centre=(0.0, 0.0), radius=1.0, axes=None)),
-        "paths.spline": (sv.paths.spline, dict(t=t, times=[0.0, 1.0, 2.0], points=[0.0, 1.0, 0.0], smoothness=2,
-                                               ends="rest")),
-        "paths.trapezoid": (sv.paths.trapezoid, dict(t=t, distance=1.0, duration=1.0, ramp=0.2, smoothness=4, t_start=0.0)),
+        "with_references": (s["model"].with_references, dict(X=path)),
+        "references": (lambda path: sv.coordinates("x y").references(X=path), dict(path=path)),
+        "references.d": (q.references(**{f"r{len(q.family)}": None}).d, dict(k=1)),
+        "path": (path, dict(t=0.5)),
+        "path.jets": (path.jets, dict(t=[0.0, 0.5], order=2)),
+        "path.then": (path.then, dict(other=path)),
+        "path.at_rate": (path.at_rate, dict(factor=2.0)),
+        "path *": (lambda factor: factor * path, dict(factor=2.0)),
+        "path +": (lambda other: path + other, dict(other=1.0)),
+        "paths.rest_to_rest": (sv.paths.rest_to_rest, dict(start=0.0, end=1.0, duration=1.0, smoothness=4, t_start=0.0)),
+        "paths.spline": (sv.paths.spline, dict(times=[0.0, 1.0, 2.0], points=[0.0, 1.0, 0.0], smoothness=2, ends="rest")),
+        "paths.trapezoid": (sv.paths.trapezoid, dict(distance=1.0, duration=1.0, ramp=0.2, smoothness=4, t_start=0.0)),
+        "paths.s_curve": (sv.paths.s_curve, dict(start=0.0, end=1.0, speed=1.0, acceleration=2.0, jerk=9.0, t_start=0.0)),
+        "paths.polynomials": (sv.paths.polynomials, dict(breaks=[0.0, 1.0], coefficients=[[1.0], [0.0]], smoothness=0,
+                                                         before="hold", after="hold")),
+        "paths.function": (sv.paths.function, dict(f=lambda t: [t**2, 2 * t, 2.0], span=(0.0, 1.0), smoothness=2,
+                                                   tolerance=1e-9, before="continue", after=None)),
+        "paths.fit": (sv.paths.fit, dict(t=s["times"], x=s["times"]**2, smoothness=2, tolerance=1e-3)),
+        "paths.as_path": (sv.paths.as_path, dict(thing=path, smoothness=None, before=None, after=None)),
+        "curves.line": (sv.curves.line, dict(s=t, start=(0.0, 0.0), end=(1.0, 1.0))),
+        "curves.circle": (sv.curves.circle, dict(angle=t, centre=(0.0, 0.0), radius=1.0, axes=None)),
+        "rotations.vectors": (sv.rotations.vectors, dict(rotations=[np.eye(3), np.diag([1.0, 1.0, 1.0])])),
         "figures.signals": (lambda run, names, ax, units: sv.figures.signals(run, names, ax=ax, units=units),
                           dict(run=plan, names=["x"], ax=None, units=None)),
         "figures.actuation": (sv.figures.actuation, dict(run=plan, ax=None, units=None, names=None)),
@@ -191,7 +208,8 @@ def swaying():
         q, gibbs=sv.particle(q, p.M, x) + sv.particle(q, p.m, load), potential=p.m * p.g * load[1], parameters=p,
         actuators={"cart": x}, outputs={"load": load[0]},
     )  # fmt: skip
-    program = sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 0.2, duration=0.5)})
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 0.2, duration=0.5))
+    program = sv.Program({"X": x - r.X})
     model = sv.derive(mechanism, program)
     run = sv.simulate(model, model.start(), (0.0, 0.5), "RK4", t_eval=np.linspace(0.0, 0.5, 51))
     return {"mechanism": mechanism, "program": program, "model": model, "run": run, "plant": sv.plant(mechanism)}
@@ -202,7 +220,8 @@ def sliding():
     q = sv.coordinates("x")
     (x,) = q
     mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), actuators={"pull": x})
-    return sv.plant(mechanism), sv.Program({"X": x - sv.paths.rest_to_rest(q.t, 0.0, 0.2, duration=0.5)})
+    r = q.references(X=sv.paths.rest_to_rest(0.0, 0.2, duration=0.5))
+    return sv.plant(mechanism), sv.Program({"X": x - r.X})
 
 
 def inverses():

@@ -42,7 +42,8 @@ def crane(unit):
     q = sv.coordinates("x l theta")
     x, l, theta = q
     load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
-    path = sv.paths.rest_to_rest(q.t, (0.0, 4.0 * unit), (5.0 * unit, 2.0 * unit), duration=6.0, smoothness=4)
+    path = sv.paths.rest_to_rest((0.0, 4.0 * unit), (5.0 * unit, 2.0 * unit), duration=6.0, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
     mechanism = sv.Mechanism(
         q,
         gibbs=sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load),
@@ -50,7 +51,7 @@ def crane(unit):
         actuators={"trolley": x, "hoist": l},
         parameters=p,
     )
-    return sv.derive(mechanism, sv.Program({"X": load[0] - path[0], "Z": load[1] - path[1]}), guess={"l": 4.0 * unit})
+    return sv.derive(mechanism, sv.Program({"X": load[0] - r.X, "Z": load[1] - r.Z}), guess={"l": 4.0 * unit})
 
 
 @pytest.mark.parametrize("unit", UNITS)
@@ -135,15 +136,15 @@ def chained(target):
         q, gibbs=sv.particle(q, 2.0, (x,)) + sv.particle(q, 1.0, (y,)), potential=50.0 * (x - y) ** 2 / 2,
         forces={"y": -3.0 * q.dt(y)}, actuators={"force": x},
     )  # fmt: skip
-    return mechanism, sv.Program({"y": y - target(q.t)})
+    return mechanism, sv.Program({"y": y - target(q)})
 
 
 def fixed_path():
-    return chained(lambda t: sv.paths.rest_to_rest(t, (0.0,), (1.0,), duration=3.0, smoothness=4)[0])
+    return chained(lambda q: q.references(y=sv.paths.rest_to_rest(0.0, 1.0, duration=3.0, smoothness=4)).y)
 
 
 def oscillator():
-    return chained(lambda t: 0.3 * ca.sin(2.0 * t))
+    return chained(lambda q: 0.3 * ca.sin(2.0 * q.t))
 
 
 SCALES = [(1e6, 1e3, 1.0), (1e-6, 1e-3, 1.0), (1.0, 1.0, 1e-6), (1.0, 1.0, 1e6)]  # units per metre, kilogram and second

@@ -57,7 +57,7 @@ def function(f, span, smoothness=4, tolerance=1e-9, *, before=None, after=None):
         return np.stack([told[x] for x in t.tolist()], axis=2)
 
     while True:
-        path = _through_jets(edges, jets(edges), before, after)
+        path = through_jets(edges, jets(edges), before, after)
         between = np.concatenate([edges[:-1] + part * np.diff(edges) for part in (0.25, 0.5, 0.75)])
         error = np.abs(path.jets(between, k) - jets(between))
         size = np.abs(np.stack(list(told.values()))).max(axis=0)[:, :, None]
@@ -71,7 +71,7 @@ def function(f, span, smoothness=4, tolerance=1e-9, *, before=None, after=None):
         edges = np.insert(edges, np.flatnonzero(high) + 1, ((edges[:-1] + edges[1:]) / 2)[high])
 
 
-def _through_jets(edges, jets, before, after):
+def through_jets(edges, jets, before, after):
     """The path through jets (k + 1, dim, n + 1) at the ends of its pieces."""
     k, origin = len(jets) - 1, jets[:1, :, :-1]
     powers, half = np.arange(k + 1)[:, None, None], np.diff(edges) / 2

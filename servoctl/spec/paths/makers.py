@@ -4,14 +4,16 @@ import functools
 import itertools
 import math
 
+import casadi as ca
 import numpy as np
 
-from servoctl.checks import array_of, as_numbers, finite, named, positive, whole_of
+from servoctl.checks import array_of, as_numbers, column, finite, named, positive, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.spec.paths import expressions
+from servoctl.spec.paths.parametric import parametric
 from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
 from servoctl.spec.paths.transition import or_expression
-from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, vector
+from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, varies, vector
 
 
 @or_expression(expressions.rest_to_rest)
@@ -24,18 +26,18 @@ def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
 
     Parameters
     ----------
-    start, end : float or (dim,) array
+    start, end : float, (dim,) array, or expressions of parameters
         The path before and after, SI.
-    duration : float
+    duration : float or SX
         Time taken [s], positive.
     smoothness : int, optional
         Class k >= 0. A crane, or two cars and a spring, need 4.
-    t_start : float, optional
+    t_start : float or SX, optional
         Time of departure [s].
 
     Returns
     -------
-    Path
+    Path, or ParametricPath with parameters
 
     Raises
     ------
@@ -43,6 +45,10 @@ def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
         If start and end differ in size, the duration is not positive, the smoothness is no integer from 0 to 100,
         or a number is not finite.
     """
+    if varies([start, end, duration, t_start]):
+        start = ca.vertcat(*column(start, "start"))
+        way = ca.vertcat(*column(end, "end", start.numel())) - start
+        return parametric(rest_to_rest(0.0, 1.0, 1.0, smoothness=smoothness), way, start, t_start, duration)
     k = _class(smoothness)
     start, end = _ends(start, end)
     t_start = finite("t_start", t_start)
@@ -60,7 +66,7 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
 
     Parameters
     ----------
-    distance : float or (dim,) array
+    distance : float, (dim,) array, or expressions of parameters
         Where the path ends, SI.
     duration : float
         Time taken [s], positive.
@@ -68,12 +74,12 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
         Length of each ramp [s], positive, at most half the duration.
     smoothness : int, optional
         Class k >= 1.
-    t_start : float, optional
+    t_start : float or SX, optional
         Time of departure [s].
 
     Returns
     -------
-    Path
+    Path, or ParametricPath with parameters
 
     Raises
     ------
@@ -81,6 +87,9 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
         If duration or ramp is not positive, the ramps do not fit in the duration, the smoothness is no integer from
         1 to 100, or a number is not finite.
     """
+    if varies([distance, t_start]):
+        unit, distance = trapezoid(1.0, duration, ramp, smoothness=smoothness), column(distance, "distance")
+        return parametric(unit, ca.vertcat(*distance), np.zeros(len(distance)), t_start)
     k, t_start = _class(smoothness, least=1), finite("t_start", t_start)
     duration, ramp = positive("duration", duration), positive("ramp", ramp)
     distance = vector("distance", distance)
@@ -168,7 +177,7 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
     ----------
     times : (n,) array
         Ascending [s], n >= 2.
-    points : (n,) or (n, dim) array
+    points : (n,) or (n, dim) array, or expressions of parameters
         SI.
     smoothness : int, optional
         Class k >= 0.
@@ -177,7 +186,7 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
 
     Returns
     -------
-    Path
+    Path, or ParametricPath with parameters
 
     Raises
     ------
@@ -187,6 +196,10 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
     NameUnknown
         If `ends` is neither "rest" nor "natural".
     """
+    if varies(points):
+        points = points if isinstance(points, ca.SX) else ca.vertcat(*(ca.horzcat(*column(x, "point")) for x in points))
+        unit = spline_through(times, np.eye(points.shape[0]), smoothness=smoothness, ends=ends)
+        return parametric(unit, points.T, ca.SX.zeros(points.shape[1]))
     rest, k = named(ends, ("rest", "natural"), "spline end") == "rest", _class(smoothness)
     times, points = samples(times, points)
     m = k if rest else (k + 1) // 2

@@ -17,13 +17,17 @@ def or_expression(old) -> Any:
     def decorator(new):
         @functools.wraps(new)
         def either(*args, **kwargs):
-            try:
-                inspect.signature(new).bind(*args, **kwargs)
-                fits = not isinstance(args[0] if args else None, ca.SX)
-            except TypeError:
-                fits = False
-            return (new if fits else old)(*args, **kwargs)
+            timed = args and isinstance(args[0], ca.SX) and _binds(old, args, kwargs)
+            return (new if _binds(new, args, kwargs) and not timed else old)(*args, **kwargs)
 
         return either
 
     return decorator
+
+
+def _binds(f, args, kwargs):
+    try:
+        inspect.signature(f).bind(*args, **kwargs)
+    except TypeError:
+        return False
+    return True

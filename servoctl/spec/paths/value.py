@@ -2,6 +2,7 @@
 
 from dataclasses import field
 
+import casadi as ca
 import numpy as np
 
 from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
@@ -140,7 +141,13 @@ class Path(Value):
         t = np.where(held, at.clip(first, last), t)
         pieces = (np.searchsorted(self.breaks, at, "right") - 1).clip(0, len(self.breaks) - 2)
         low, high = self.breaks[pieces], self.breaks[pieces + 1]
-        result = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
+        tau = ((t - low) + (t - high)) / (high - low)
+        result = taylor(self.coefficients, pieces, tau, order)
+        ends = np.abs(tau) == 1.0
+        if ends.any():  # where a path rests its derivatives are zero: rounding would determine directions
+            terms = taylor(np.abs(self.coefficients), pieces[ends], np.ones(ends.sum()), order)
+            rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
+            result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
         result[1:, held] = 0.0
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
@@ -158,6 +165,12 @@ class Path(Value):
                     end=float(self.breaks[end]),
                 )
 
+    def _parametric(self):
+        """The same path, whose numbers may become expressions."""
+        from servoctl.spec.paths.parametric import parametric
+
+        return parametric(self._with(), np.eye(self.dim), np.zeros(self.dim))
+
     def held(self):
         """The path that is held outside where nothing was said of it."""
         if self.before and self.after:
@@ -170,10 +183,12 @@ class Path(Value):
     def breaks_below(self, smooth, low, high):
         """Instants (N,) from `low` to `high` at which fewer than `smooth` derivatives are continuous."""
         breaks = self.breaks[self.classes < smooth]
+        if not breaks.size:
+            return breaks
         if self.before == "periodic":
             first, period = self.breaks[0], self.breaks[-1] - self.breaks[0]
             turns = np.arange(np.floor((low - first) / period), np.ceil((high - first) / period))
-            breaks = np.unique(breaks + period * turns[:, None]) if breaks.size else breaks
+            breaks = np.unique(breaks + period * turns[:, None])
         return breaks[(low <= breaks) & (breaks <= high)]
 
     def __len__(self):
@@ -195,6 +210,8 @@ class Path(Value):
         return Path, (self.breaks, self.coefficients, self.classes, self.before, self.after, self.remark)
 
     def __mul__(self, factor):
+        if varies(factor):
+            return self._parametric() * factor
         return self._with(coefficients=self.coefficients * finite("factor", factor, "multiple of a path"))
 
     __rmul__ = __mul__
@@ -204,6 +221,8 @@ class Path(Value):
 
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
+        if varies(other):
+            return self._parametric() + other
         if not isinstance(other, Path):
             constant = vector("The constant added to a path", other)
             _require_dim(self.dim, len(constant))
@@ -217,6 +236,8 @@ class Path(Value):
     __radd__ = __add__
 
     def __sub__(self, other):
+        if varies(other):
+            return -(-self + other)
         return self + (-other if isinstance(other, Path) else -vector("The constant taken from a path", other))
 
     def __rsub__(self, other):
@@ -267,6 +288,8 @@ class Path(Value):
         -------
         Path
         """
+        if varies([factor, about]):
+            return self._parametric().at_rate(factor, about)
         fixed = self.breaks[0] if about is None else finite("about", about, "instant")
         return self._with(breaks=fixed + (self.breaks - fixed) / positive("factor", factor))
 
@@ -302,6 +325,15 @@ class Path(Value):
         ends = ", ".join(f"{side}: {does[rule]}" + f" (class {c:g})" * bool(c < np.inf) for side, rule, c in sides)
         text = f"{span}, degree {self.coefficients.shape[2] - 1}{between}\n  {ends}"
         return text + f"\n  {self.remark}" * bool(self.remark)
+
+
+def varies(value):
+    """Whether what stands in place of a number is an expression of parameters, or contains one."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and any(map(varies, value.ravel()))
+    if isinstance(value, (list, tuple)):
+        return any(map(varies, value))
+    return isinstance(value, ca.SX) and not value.is_constant()
 
 
 def _require_dim(dim, other):
