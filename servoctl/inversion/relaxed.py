@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 
 from servoctl.checks import (
@@ -43,7 +42,7 @@ from servoctl.plants.plant import Plant, part_of
 from servoctl.reduction.idle import names_of, needed
 from servoctl.reduction.reduce import require_parts
 from servoctl.run import Run
-from servoctl.spec.paths import piecewise
+from servoctl.spec.paths import Path
 from servoctl.spec.program import Program
 from servoctl.study.table import Study, machine
 from servoctl.values import frozen
@@ -373,9 +372,10 @@ class Relaxation(Transfer):
 
     def _as_run(self, plan):
         """The run of the plant under the plan's inputs."""
-        mesh, mechanism = plan.mesh, self.plant.mechanism
-        u = piecewise(mechanism.q.t, plan.pieces.edges, plan.pieces.power_coefficients(plan.points))
-        inputs = dict(zip(self.plant.inputs, ca.vertsplit(u), strict=True))
+        mesh, coefficients = plan.mesh, plan.pieces.power_coefficients(plan.points).transpose(1, 2, 0)
+        classes = np.pad(np.zeros(len(plan.pieces.h) - 1), 1, constant_values=np.inf)  # inputs are continuous
+        path = Path(plan.pieces.edges, coefficients, classes, "continue", "continue")
+        inputs = {name: path[i] for i, name in enumerate(self.plant.inputs)}
         model = driven(self.plant, inputs, self.program.residuals)
         parts = max(1, -(-SAMPLES // len(mesh.h)))
         t = subdivided(mesh.edges, np.full(len(mesh.h), parts))

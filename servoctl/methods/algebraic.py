@@ -213,6 +213,6 @@ class _Algebraic(Stepping):
 
 def switched(reduction):
     """Whether a row of the motion has a kink or a switch that the motion may cross."""
-    branches = Branches(reduction.mechanism.q.is_jet)
+    branches = Branches(reduction.mechanism.q.moves)
     branches.smooth([row.expression for row in reduction.rows], angles=True)
     return bool(branches.switches)

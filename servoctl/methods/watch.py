@@ -129,6 +129,7 @@ class Switches:
         functions, slopes, _ = self.family.values(self.branches, t, x)
         allowed = self.tolerance.of(slopes, x)
         wrong = functions < -allowed
+        wrong[:, 0] = False  # where the branches were chosen: a root that is rounded
         last = max(int(np.argmax(wrong.any(axis=0))), 1) if wrong.any() else len(t)
         direction = np.copysign(1.0, t[-1] - t[0])
 

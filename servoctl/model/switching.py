@@ -27,7 +27,7 @@ class Switching:
         r, q = model.reduction, model.reduction.mechanism.q
         self.model = model
         names = r.mechanism.parameters.names
-        branches = Branches(q.is_jet, names)
+        branches = Branches(q.moves, names)
         self._specification = _smooth(r.mechanism, r.program, _angles(model), branches)
         self.switches = branches.switches
         for s in self.switches:
@@ -89,7 +89,7 @@ class Switching:
                 self._sides[sides] = self._derived(sides, branches)
             model = self._sides[sides]
             values = np.append(self.model.parameters, branches)
-            parts = model.reduction, model._store, values, model._knots, model._functions
+            parts = model.reduction, model._store, values, model._functions
             self._models[branches] = Model(*parts, paths=self.model.paths)
         return self._models[branches]
 

@@ -130,7 +130,7 @@ def _formed(model, form):
         return model._variants[key]
     reduction = definite(r) if form == DIAGONAL else r.with_order(form)
     store, functions = model._store.part(form), model._functions.setdefault(str(form), {})
-    numbers = model.parameters, model._knots, functions, model._variants, model.paths
+    numbers = model.parameters, functions, model._variants, model.paths
     made = reduction and type(model)(reduction, store, *numbers)
     return _kept(model, key, made)
 

@@ -7,16 +7,22 @@ from servoctl.errors import SpecificationError
 from servoctl.jets.overflow import settled
 from servoctl.model.model import derive
 from servoctl.plants.plant import made_again
+from servoctl.spec.paths import Path, polynomials
+from servoctl.spec.paths.limited import limited
+from servoctl.spec.paths.parametric import ParametricPath
 from servoctl.spec.program import no_program
+from servoctl.spec.references import followed_path
+
+CLOCK = "clock_of_limits"  # the reference that is the time
 
 
 def driven(plant, inputs=None, residuals=None):
     """The model of a plant under given inputs, within its limits of magnitude.
 
     A plant with lag, transport delay or limits of rate is refused. Inputs by actuator, 0 by default, are numbers,
-    expressions of `q.t` or of references, or functions that give them of `q.t`; `residuals` are those of a program that
-    the inputs realise approximately, which runs report. Free initial values are all states that the material
-    constraints leave; outputs include the inputs.
+    paths, expressions of `q.t` and references, or functions that give these of `q.t`; `residuals` are those of a
+    program that the inputs realise approximately, which runs report. Free initial values are all states that the
+    material constraints leave; outputs include the inputs.
     """
     for what, value in (("lag", plant.lag), ("delay", plant.delay), ("rate_limits", plant.rate_limits)):
         if value:
@@ -27,17 +33,30 @@ def driven(plant, inputs=None, residuals=None):
                 name=what,
                 value=value,
             )
-    mechanism, t = plant.mechanism, plant.mechanism.q.t
-    values = by_name(inputs, plant.inputs, "actuator", "The inputs")
-    expressions = {name: _expression(name, values.get(name, 0.0), t) for name in plant.inputs}
-    for name, (low, high) in plant.limits.items():
-        expressions[name] = ca.fmin(ca.fmax(expressions[name], low), high)
+    mechanism, values = plant.mechanism, by_name(inputs, plant.inputs, "actuator", "The inputs")
+    q, expressions = _expressions(mechanism.q, {name: values.get(name, 0.0) for name in plant.inputs}, plant.limits)
     count = len(mechanism.parameters.names)
     damping = ca.SX(list(plant.parameters[count : count + plant.equations.damping.numel()]))
     further = plant.equations.forces + ca.substitute(plant.equations.resisting, plant.equations.damping, damping)
-    model = derive(mechanism.under(expressions, further, residuals), no_program())
+    model = derive(mechanism.under(expressions, further, residuals, q), no_program(jumps=True))
     model = model.with_references(**{name: path for name, path in plant.paths.items() if name in model.paths})
     return model.with_parameters(**dict(zip(mechanism.parameters.names, plant.parameters[:count], strict=True)))
+
+
+def _expressions(q, values, limits):
+    """The coordinates with the paths of inputs as references, and the inputs within their limits as expressions.
+
+    A formula within limits is one of a reference that is the time, so that motions find its kinks as any other ones.
+    """
+    paths = {n: followed_path(n, value) for n, value in values.items() if isinstance(value, (Path, ParametricPath))}
+    cut = {name: sides for name, sides in limits.items() if not isinstance(values[name], Path)}
+    paths |= {n: limited(paths[n].held(), *sides) for n, sides in limits.items() if n in paths and n not in cut}
+    clock = {CLOCK: polynomials([0.0, 1.0], [[1.0], [0.0]], before="continue", after="continue")} if cut else {}
+    q, r = q.beside(**{f"{name}_path": path for name, path in paths.items()}, **clock)
+    inputs = {name: r[f"{name}_path"] if name in paths else _expression(name, values[name], q.t) for name in values}
+    for name, (low, high) in cut.items():
+        inputs[name] = ca.fmin(ca.fmax(ca.substitute(inputs[name], q.t, r[CLOCK]), low), high)
+    return q, inputs
 
 
 def _expression(name, value, t):
@@ -48,7 +67,7 @@ def _expression(name, value, t):
         raise SpecificationError(
             f"The input {name!r} is a function that takes no symbol ({type(error).__name__}).",
             "A function of an input is evaluated once, at q.t: by arithmetic and CasADi's functions.",
-            do="Use CasADi's functions; samples are q.references(u=sv.paths.spline(times, points)).u, a reference.",
+            do="Pass a path, as sv.paths.spline(times, points) through samples, or use CasADi's functions.",
             name=name,
         ) from error
     return settled(column(value, f"the input {name!r}", 1))[0]

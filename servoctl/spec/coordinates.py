@@ -264,6 +264,12 @@ class Coordinates:
         """
         return self.family.add(paths)
 
+    def beside(self, **paths):
+        """The same coordinates with further references of their own, and the symbols of these: (q, r)."""
+        other = object.__new__(Coordinates)
+        vars(other).update(vars(self), family=self.family.again())
+        return other, other.references(**paths)
+
     def dt(self, expression, k=1):
         """The k-th total time derivative of an expression of t, q and the jets.
 
@@ -294,6 +300,10 @@ class Coordinates:
     def is_jet(self, symbol):
         """Whether a symbol is a coordinate, or one of the jets of a quasi-velocity."""
         return (self.where(symbol) or "t")[0] in "qw"
+
+    def moves(self, symbol):
+        """Whether a symbol is a jet, of a coordinate or of a reference."""
+        return (self.where(symbol) or "t")[0] != "t"
 
     def order(self, expression):
         """The highest k for which γ^(k) is in an expression; 0 for q alone, -1 for neither."""

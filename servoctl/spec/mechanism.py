@@ -271,7 +271,7 @@ class Mechanism(Shown):
                     )
         return unknown(name, valid, what)
 
-    def under(self, inputs, forces, reported=None):
+    def under(self, inputs, forces, reported=None, q=None):
         """The mechanism without actuators, whose inputs are forces and outputs instead.
 
         Parameters
@@ -282,10 +282,12 @@ class Mechanism(Shown):
             Further generalised forces.
         reported : dict of str to SX, optional
             Residuals that runs report: those of a program that the inputs realise approximately.
+        q : Coordinates, optional
+            The same coordinates with references that only the inputs contain.
         """
         driving = self.E @ ca.vertcat(*(inputs[name] for name in self.actuators)) if self.actuators else 0
         driven = Mechanism(
-            self.q,
+            q or self.q,
             self._gibbs,
             self.potential,
             None,

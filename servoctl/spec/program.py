@@ -200,11 +200,11 @@ class Program(Packed):
         return f"Program({', '.join(self.residuals)}; by {self.by})"
 
 
-def no_program():
-    """The program without residuals: forces alone determine the motion."""
+def no_program(jumps=False):
+    """The program without residuals: forces alone determine the motion, and may jump if so."""
     program = object.__new__(Program)
     program.by, program.residuals, program.with_turns, program.weights, program.toward = "actuators", {}, {}, {}, {}
-    program.metric, program.jumps = "actuators", False
+    program.metric, program.jumps = "actuators", jumps
     return program
 
 

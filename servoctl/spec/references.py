@@ -64,6 +64,13 @@ class Family:
     def __len__(self):
         return len(self.paths)
 
+    def again(self):
+        """The same references, with the same symbols, to which others can be added."""
+        other = Family(self.paths)
+        with _lock:
+            other._symbols, other._places = dict(self._symbols), dict(self._places)
+        return other
+
     def __reduce__(self):
         return Family, (self.paths,)
 

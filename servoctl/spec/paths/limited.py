@@ -1,0 +1,39 @@
+"""Paths within limits."""
+
+import numpy as np
+
+from servoctl.spec.paths.value import SAME, Path
+
+
+def limited(path, low, high):
+    """A path of one component that stays at a limit where it would exceed it; of class 0 where it reaches one."""
+    met = _instants_at(path, low, high)
+    breaks = np.unique(np.concatenate([path.breaks, met]))
+    breaks = breaks[np.append(True, np.diff(breaks) > SAME * np.abs(breaks).max())]
+    own = np.clip(np.searchsorted(path.breaks, breaks), 0, len(path.breaks) - 1)
+    classes = np.where(path.breaks[own] == breaks, path.classes[own], 0.0)
+    half = np.diff(breaks) / 2
+    middles = breaks[:-1] + half
+    table = path._taylor(middles, path.coefficients.shape[2] - 1, half, middles)
+    for limit, beyond in ((low, table[0] < low), (high, table[0] > high)):
+        table[:, beyond] = 0.0
+        table[0, beyond] = limit
+    return Path(breaks, table.transpose(1, 2, 0), classes, path.before, path.after)
+
+
+def _instants_at(path, low, high):
+    """Instants (N,) at which a path has the value of a limit; where it goes on outside, another beyond them all."""
+    found, last = [], len(path.breaks) - 2
+    for i, (a, b, c) in enumerate(zip(path.breaks[:-1], path.breaks[1:], path.coefficients[:, 0], strict=True)):
+        roots = np.concatenate([np.zeros(0), *(_roots(c, limit) for limit in (low, high) if np.isfinite(limit))])
+        first_goes_on, last_goes_on = i == 0 and path.before == "continue", i == last and path.after == "continue"
+        inside = ((roots > -1) | first_goes_on) & ((roots < 1) | last_goes_on)
+        outermost = [roots.min(initial=-1.0) - 1] * first_goes_on + [roots.max(initial=1.0) + 1] * last_goes_on
+        found.append(a + (b - a) * (1 + np.concatenate([roots[inside], outermost])) / 2)
+    return np.concatenate(found)
+
+
+def _roots(c, limit):
+    """The real places at which a polynomial (size,) has a value."""
+    roots = np.polynomial.polynomial.polyroots(np.trim_zeros([c[0] - limit, *c[1:]], "b"))
+    return roots[np.isreal(roots)].real
