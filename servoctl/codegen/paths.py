@@ -41,12 +41,6 @@ class Followed:
 
         They are NaN where a time is none: steps that fail ask for such, and are told by what they get.
         """
-        known = np.isfinite(t)
-        if not known.all():
-            jets = np.full(((order + 1) * len(self.paths), len(t)), np.nan)
-            if known.any():
-                jets[:, known] = self.jets(t[known], order, None if instant is None else instant[known])
-            return jets
         key = tuple(np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
         last, jets = self._last
         size = (order + 1) * len(self.paths)
