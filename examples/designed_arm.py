@@ -17,7 +17,7 @@ def arm(**values):
     mechanism, _ = two_link_arm()
     mechanism.parameters = p = mechanism.parameters.extended(via_x=MIDDLE[0], via_y=MIDDLE[1], duration=1.0)
     points = [START, (p.via_x, p.via_y), END]
-    path = sv.paths.spline(p.duration * np.array([0.0, 0.5, 1.0]), points, smoothness=2)
+    path = sv.paths.spline([0.0, 0.5, 1.0], points, smoothness=2).at_rate(1 / p.duration)
     r, end = mechanism.q.references(end_x=path[0], end_y=path[1]), mechanism.outputs
     model = sv.derive(mechanism, sv.Program({"X": end["X_end"] - r.end_x, "Y": end["Y_end"] - r.end_y}))
     return model.with_parameters(**values), p

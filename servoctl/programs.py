@@ -48,7 +48,7 @@ def follow_point(name, position, target):
 
 
 def follow_path(name, position, path, along):
-    """A point stays on a path: at a given time law, or freely, with the path's parameter as a further coordinate.
+    """A point stays on a curve: as a reference says, or freely, with the curve's parameter as a further coordinate.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def follow_path(name, position, path, along):
     path : callable
         The path [m] as a function of its parameter: `lambda s: sv.curves.circle(s, (0, 1), 0.5)`.
     along : SX
-        The parameter: a time law, or the symbol of a coordinate that only says how far the point is; the point is then
+        The parameter: a reference, or the symbol of a coordinate that only says how far the point is; the point is then
         free along the path.
 
     Returns
@@ -70,7 +70,7 @@ def follow_path(name, position, path, along):
         raise SpecificationError(
             f"The path of {name!r} is a {type(path).__name__}.",
             "It is a function of the path's parameter.",
-            do="Write lambda s: sv.curves.line(s, start, end); for an expression of time, use follow_point.",
+            do="Write lambda s: sv.curves.line(s, start, end); for references X, Z, use follow_point.",
             name=name,
         )
     return follow_point(name, position, path(_scalar(along, f"the parameter of {name!r}")))

@@ -592,6 +592,8 @@ REFUSED = [
     (lambda: trapezoid(1.0, 2.0, 1.5), ["1.5 s", "A ramp of 1 s"], {"ramp": 1.5, "duration": 2.0}),
     (lambda: trapezoid(1.0, 2.0, 1.0, smoothness=0), ["smoothness=0", "smoothness=1"], {"smoothness": 0}),
     (lambda: s_curve(0.0, 0.0, 1.0, 1.0, 1.0), ["both [0.0]"], {"start": [0.0]}),
+    (lambda: s_curve(0.0, 1e15, 1.0, 1.0, 1.0), ["1e+15 s", "rises for 1 s"], {"rise": 1.0}),
+    (lambda: polynomials([0.0, 1.0], [[1.0]], before={"x": 1.0}), ["before={'x': 1.0}"], {"after": None}),
     (lambda: s_curve(0.0, 1.0, 1.0, -1.0, 1.0), ["acceleration=-1"], {"name": "acceleration"}),
     (lambda: spline([0.0, 1.0, 1.0], [0.0, 1.0, 2.0]), ["times 1 and 2 are 1, 1"], {"index": 2}),
     (lambda: spline([0.0, 1.0], [0.0, 1.0, 2.0]), ["(2,)", "(3,)"], {"points": (3,)}),

@@ -47,13 +47,14 @@ class Followed:
             if known.any():
                 jets[:, known] = self.jets(t[known], order, None if instant is None else instant[known])
             return jets
-        key = (order, *np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
+        key = tuple(np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
         last, jets = self._last
-        if key is None or key != last:  # iterations ask for one instant again and again
+        size = (order + 1) * len(self.paths)
+        if key is None or key != last or len(jets) < size:  # functions ask for one instant again and again
             rows = [path.jets(t, order, instant)[:, 0] for path in self.paths]
             jets = np.stack(rows, axis=1).reshape(-1, len(t))
             self._last = (key, jets) if key else self._last
-        return jets
+        return jets[:size]
 
 
 def followed(address):

@@ -9,8 +9,7 @@ from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.model.points import with_place
-from servoctl.spec.paths.parametric import parameters_of
-from servoctl.spec.paths.value import SAME
+from servoctl.spec.paths.value import SAME, parameters_of
 from servoctl.spec.references import required_paths
 
 SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
@@ -88,7 +87,7 @@ def p_with_rates(model, pairs):
         rates = []
         for reference in dict.fromkeys(r for r, _ in pairs):  # pairs are in their order
             of = [_written(model)[name] for r, name in pairs if r == reference]
-            rates += model.paths[reference].source.rates(_numbers(model), of)
+            rates += model.paths[reference].source.rates(_numbers_in_paths(model), of)
         known[pairs] = Followed([*model._followed.paths, *(rate.held() for rate in rates)])
     return with_place((known[pairs].address,), model.parameters)
 
@@ -103,7 +102,7 @@ def instant_by(model, name, t):
         k = int(np.argmin(np.abs(path.breaks - t)))
         if path.classes[k] <= model.reduction.follows[reference] and abs(path.breaks[k] - t) <= SAME * abs(t):
             moves = written in parameters_of(path)
-            rates[reference] = path.source.moved(_numbers(model), written)[k] if moves else 0.0
+            rates[reference] = path.source.moved(_numbers_in_paths(model), written)[k] if moves else 0.0
     if len({*rates.values()}) > 1:
         raise SpecificationError(
             f"At t = {t:.6g} s the paths of {', '.join(rates)} have breaks that move differently with {name!r}.",
@@ -121,7 +120,7 @@ def _written(model):
     return {name: symbol.name() for name, symbol in zip(parameters.names, parameters.symbols, strict=True)}
 
 
-def _numbers(model):
+def _numbers_in_paths(model):
     """Values of the parameters as paths have them."""
     return dict(zip(_written(model).values(), model.parameters.tolist(), strict=True))
 

@@ -9,9 +9,9 @@ import numpy as np
 from servoctl.checks import by_name, named, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, column_of
-from servoctl.spec.paths.parametric import ParametricPath, parameters_of, path_at
+from servoctl.spec.paths.parametric import ParametricPath
 from servoctl.spec.paths.scipy_paths import as_path
-from servoctl.spec.paths.value import Path
+from servoctl.spec.paths.value import Path, parameters_of, path_at
 
 _lock = threading.Lock()
 

@@ -95,6 +95,7 @@ def vectors(rotations):
     SpecificationError
         If there is none, one is no rotation, or is half a turn from the middle one.
     """
+    rotations = array_of("rotations", rotations, None, 3, 3)
     rotations = [_matrix_of_numbers(rotation, f"rotations[{i}]") for i, rotation in enumerate(rotations)]
     if not rotations:
         raise SpecificationError("No rotation is given.", "A path passes through two at least.")

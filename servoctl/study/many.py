@@ -22,8 +22,7 @@ from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
-from servoctl.spec.paths.parametric import PathAt
-from servoctl.spec.paths.value import Path
+from servoctl.spec.paths.value import Path, PathAt
 from servoctl.spec.references import followed_path, paths_at
 from servoctl.study.batch import FINAL, Batch, failure, of_finished
 from servoctl.study.cases import as_columns

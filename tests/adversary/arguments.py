@@ -185,7 +185,7 @@ def calls():
         "paths.as_path": (sv.paths.as_path, dict(thing=path, smoothness=None, before=None, after=None)),
         "curves.line": (sv.curves.line, dict(s=t, start=(0.0, 0.0), end=(1.0, 1.0))),
         "curves.circle": (sv.curves.circle, dict(angle=t, centre=(0.0, 0.0), radius=1.0, axes=None)),
-        "rotations.vectors": (sv.rotations.vectors, dict(rotations=[np.eye(3), np.diag([1.0, 1.0, 1.0])])),
+        "rotations.vectors": (sv.rotations.vectors, dict(rotations=[np.eye(3), np.eye(3)])),
         "figures.signals": (lambda run, names, ax, units: sv.figures.signals(run, names, ax=ax, units=units),
                           dict(run=plan, names=["x"], ax=None, units=None)),
         "figures.actuation": (sv.figures.actuation, dict(run=plan, ax=None, units=None, names=None)),

@@ -10,10 +10,10 @@ import numpy as np
 from servoctl.checks import array_of, as_numbers, column, finite, named, positive, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.spec.paths import expressions
-from servoctl.spec.paths.parametric import parametric
+from servoctl.spec.paths.parametric import parametric, varies
 from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
 from servoctl.spec.paths.transition import or_expression
-from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, varies, vector
+from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, vector
 
 
 @or_expression(expressions.rest_to_rest)
@@ -143,7 +143,7 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     from scipy.interpolate import PPoly
 
     start, end = _ends(start, end)
-    distance = float(np.linalg.norm(end - start))
+    distance = math.hypot(*(end - start))
     if distance == 0.0:
         rule, do = "They differ.", "Use rest_to_rest for a path that stands still."
         raise SpecificationError(f"start and end are both {end.tolist()}.", rule, do=do, start=end.tolist())
@@ -153,6 +153,14 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     constant = max(0.0, min(v / a - rise, math.sqrt(rise**2 / 4 + distance / a) - 1.5 * rise))  # of the acceleration
     cruise = max(0.0, distance / (a * (rise + constant)) - 2 * rise - constant)
     phases = np.array([rise, constant, rise, cruise, rise, constant, rise])
+    if not rise > SAME * phases.sum():
+        raise SpecificationError(
+            f"Of {phases.sum():.3g} s in all, the acceleration rises for {rise:.3g} s.",
+            f"Phases of a path last for more than {SAME:g} of it: shorter ones are rounding.",
+            do="Give a shorter distance, a higher speed or a lower jerk.",
+            duration=float(phases.sum()),
+            rise=rise,
+        )
     lasting = phases > SAME * phases.sum()  # others are rounding
     breaks = np.append(0.0, np.cumsum(phases[lasting]))
     jerks = np.array([1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0])[lasting] * j / distance
@@ -197,7 +205,10 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
         If `ends` is neither "rest" nor "natural".
     """
     if varies(points):
-        points = points if isinstance(points, ca.SX) else ca.vertcat(*(ca.horzcat(*column(x, "point")) for x in points))
+        if not isinstance(points, ca.SX):
+            dim = len(column(points[0], "point 0"))
+            rows = (ca.horzcat(*column(point, f"point {i}", dim)) for i, point in enumerate(points))
+            points = ca.vertcat(*rows)
         unit = spline_through(times, np.eye(points.shape[0]), smoothness=smoothness, ends=ends)
         return parametric(unit, points.T, ca.SX.zeros(points.shape[1]))
     rest, k = named(ends, ("rest", "natural"), "spline end") == "rest", _class(smoothness)

@@ -7,16 +7,18 @@ On each piece r = sum c_j(p) tau^j, where tau = (t - m(p))/h(p) goes from -1 to 
 is a polynomial of the same degree on the same piece: a further row of the table of paths that a model follows.
 """
 
-from dataclasses import field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import by_name, column, finite, positive, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths.value import Path
 from servoctl.values import Value, frozen
+
+if TYPE_CHECKING:
+    from servoctl.spec.paths.value import Path
 
 
 @frozen(eq=False)
@@ -38,13 +40,13 @@ class ParametricPath(Value):
         The function of the parameters that returns A (dim, n), b, t0 and T, serialised.
     """
 
-    base: Path
+    base: "Path"
     names: tuple
     dim: int
     content: str
     __array_ufunc__ = None  # as of `Path`
 
-    def at(self, **numbers: float) -> Path:
+    def at(self, **numbers: float) -> "Path":
         """The path with numbers of its parameters.
 
         Parameters
@@ -87,7 +89,7 @@ class ParametricPath(Value):
         coefficients = A @ self.base.coefficients
         coefficients[:, :, 0] += b[:, 0]
         breaks = t0[0, 0] + positive("duration", T[0, 0]) * self.base.breaks
-        return Path(breaks, coefficients, self.base.classes, self.base.before, self.base.after)
+        return self.base._with(breaks=breaks, coefficients=coefficients)
 
     @cached_property
     def _slopes(self):
@@ -120,7 +122,7 @@ class ParametricPath(Value):
             broken = (moves != 0) & np.isfinite(path.classes)
             self._require_known_outside(path, broken)
             classes = np.maximum(path.classes - broken, -1.0)
-            result.append(Path(path.breaks, table, classes, path.before, path.after))
+            result.append(path._with(coefficients=table, classes=classes))
         return result
 
     def _require_known_outside(self, path, moves):
@@ -158,7 +160,7 @@ class ParametricPath(Value):
 
     def __add__(self, other):
         """The sum with a constant: a number or an expression, or a vector (dim,) of them."""
-        if isinstance(other, (Path, ParametricPath)):
+        if isinstance(other, (type(self.base), ParametricPath)):
             raise SpecificationError(
                 "A path is added to one with parameters.",
                 "A path with parameters is added to and multiplied by numbers and parameters.",
@@ -187,7 +189,7 @@ class ParametricPath(Value):
         raise self._without_numbers("path(t)")
 
     def __getattr__(self, name):
-        if name.startswith("_") or not hasattr(Path, name) and name not in Path.__dataclass_fields__:
+        if name.startswith("_") or not hasattr(self.base, name):
             raise AttributeError(name)
         raise self._without_numbers(f"path.{name}")
 
@@ -216,26 +218,10 @@ def parametric(base, A, b, t0=0.0, T=1.0):
     return ParametricPath(base, tuple(known), forms[0].size1(), f.serialize())
 
 
-@frozen(eq=False, repr=False)
-class PathAt(Path):
-    """A path with the numbers of a model, and the one with parameters that it was made of, its `source`."""
-
-    source: ParametricPath = field(default=None, repr=False)
-
-    def __reduce__(self):
-        return PathAt, (*super().__reduce__()[1], self.source)
-
-
-def path_at(path, numbers):
-    """A path with numbers of parameters by name: itself if it contains none."""
-    source = path.source if isinstance(path, PathAt) else path
-    if not isinstance(source, ParametricPath):
-        return path
-    made = source.made(numbers)
-    said = f"with {', '.join(f'{name} = {numbers[name]:g}' for name in source.names)}"
-    return PathAt(made.breaks, made.coefficients, made.classes, made.before, made.after, said, source)
-
-
-def parameters_of(path):
-    """Names of the parameters of a path."""
-    return path.names if isinstance(path, ParametricPath) else path.source.names if isinstance(path, PathAt) else ()
+def varies(value):
+    """Whether what stands in place of a number is an expression of parameters, or contains one."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == object and any(map(varies, value.ravel()))
+    if isinstance(value, (list, tuple)):
+        return any(map(varies, value))
+    return isinstance(value, ca.SX) and not value.is_constant()

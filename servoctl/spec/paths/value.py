@@ -2,11 +2,11 @@
 
 from dataclasses import field
 
-import casadi as ca
 import numpy as np
 
 from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
 from servoctl.errors import SpecificationError
+from servoctl.spec.paths.parametric import ParametricPath, parametric, varies
 from servoctl.values import Value, frozen, read_only
 
 RULES = ("hold", "continue", "periodic", None)
@@ -64,13 +64,7 @@ class Path(Value):
                 shape=shape,
             )
         require_ascending("breaks", self.breaks)
-        if not {self.before, self.after} <= set(RULES) or (self.before == "periodic") != (self.after == "periodic"):
-            raise SpecificationError(
-                f"The path has before={self.before!r}, after={self.after!r}.",
-                f"Each is one of {', '.join(map(repr, RULES))}, and a path that is periodic is so on both sides.",
-                before=self.before,
-                after=self.after,
-            )
+        _require_rules(self.before, self.after)
 
     @property
     def dim(self):
@@ -167,8 +161,6 @@ class Path(Value):
 
     def _parametric(self):
         """The same path, whose numbers may become expressions."""
-        from servoctl.spec.paths.parametric import parametric
-
         return parametric(self._with(), np.eye(self.dim), np.zeros(self.dim))
 
     def held(self):
@@ -221,7 +213,7 @@ class Path(Value):
 
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
-        if varies(other):
+        if varies(other) or isinstance(other, ParametricPath):
             return self._parametric() + other
         if not isinstance(other, Path):
             constant = vector("The constant added to a path", other)
@@ -236,7 +228,7 @@ class Path(Value):
     __radd__ = __add__
 
     def __sub__(self, other):
-        if varies(other):
+        if varies(other) or isinstance(other, ParametricPath):
             return -(-self + other)
         return self + (-other if isinstance(other, Path) else -vector("The constant taken from a path", other))
 
@@ -327,15 +319,6 @@ class Path(Value):
         return text + f"\n  {self.remark}" * bool(self.remark)
 
 
-def varies(value):
-    """Whether what stands in place of a number is an expression of parameters, or contains one."""
-    if isinstance(value, np.ndarray):
-        return value.dtype == object and any(map(varies, value.ravel()))
-    if isinstance(value, (list, tuple)):
-        return any(map(varies, value))
-    return isinstance(value, ca.SX) and not value.is_constant()
-
-
 def _require_dim(dim, other):
     if dim != other:
         rule = "Paths are joined component by component."
@@ -379,8 +362,20 @@ def taylor_at(breaks, coefficients, tau):
         return taylor(coefficients, np.arange(n), np.full(n, float(tau)), size - 1) * unit[:, :, None]
 
 
+def _require_rules(before, after):
+    named = all(rule is None or isinstance(rule, str) and rule in RULES for rule in (before, after))
+    if not named or (before == "periodic") != (after == "periodic"):
+        raise SpecificationError(
+            f"The path has before={before!r}, after={after!r}.",
+            f"Each is one of {', '.join(map(repr, RULES))}, and a path that is periodic is so on both sides.",
+            before=before,
+            after=after,
+        )
+
+
 def counted(breaks, coefficients, before=None, after=None):
     """The classes (n + 1,) at breaks, as far as derivatives agree up to `COUNTED` of their sizes."""
+    _require_rules(before, after)
     starts, stops = (taylor_at(breaks, coefficients, tau) for tau in (-1.0, 1.0))
     jumps = np.concatenate([starts[:, :1], starts[:, 1:] - stops[:, :-1], stops[:, -1:]], axis=1)
     jumps[0, [0, -1]] = 0.0  # at the ends: how many derivatives vanish
@@ -452,3 +447,28 @@ def stacked(*paths):
     """One path with the components of several, on common breaks, each of the lowest of their classes."""
     tables, fields = together(*paths)
     return Path(coefficients=np.concatenate(tables, axis=1), **fields)
+
+
+@frozen(eq=False, repr=False)
+class PathAt(Path):
+    """A path with the numbers of a model, and the one with parameters that it was made of, its `source`."""
+
+    source: ParametricPath = field(default=None, repr=False)
+
+    def __reduce__(self):
+        return PathAt, (*super().__reduce__()[1], self.source)
+
+
+def path_at(path, numbers):
+    """A path with numbers of parameters by name: itself if it contains none."""
+    source = path.source if isinstance(path, PathAt) else path
+    if not isinstance(source, ParametricPath):
+        return path
+    made = source.made(numbers)
+    said = f"with {', '.join(f'{name} = {numbers[name]:g}' for name in source.names)}"
+    return PathAt(made.breaks, made.coefficients, made.classes, made.before, made.after, said, source)
+
+
+def parameters_of(path):
+    """Names of the parameters of a path."""
+    return path.names if isinstance(path, ParametricPath) else path.source.names if isinstance(path, PathAt) else ()
