@@ -1,6 +1,5 @@
 """Verdicts, inverses, zeros and time laws along references."""
 
-import casadi as ca
 import numpy as np
 import pytest
 import referred
@@ -8,7 +7,6 @@ from refusals import refused
 from scipy.integrate import solve_bvp
 
 import servoctl as sv
-from servoctl.control.time_optimal import in_formulas
 from servoctl.errors import SpecificationError
 
 
@@ -99,17 +97,6 @@ def test_a_slower_program_of_speeds_scales_the_jets_of_references():
     with refused(SpecificationError, "follows v", "path.at_rate(0.5, about=0)"):
         program.slowed(q, 2.0)
 
-
-def test_a_path_is_the_same_as_a_formula_of_time():
-    mechanism, program = parts(referred.crane())
-    q, paths = mechanism.q, mechanism.q.family.paths
-    found = in_formulas(q, program, paths).residuals
-    at = [*q]
-    rows = ca.Function("rows", [q.t, ca.vertcat(*at)], [ca.vertcat(*found.values())])
-    for t in (-1.0, 0.0, 2.2, 6.0, 7.5):
-        x, l, theta = np.array([0.3, 3.1, 0.2])
-        wanted = x + l * np.sin(theta) - paths["X"](t), -l * np.cos(theta) + paths["Z"](t)
-        assert np.allclose(np.array(rows(t, [x, l, theta])).ravel(), wanted, rtol=0, atol=1e-14)
 
 
 def test_a_time_law_is_not_sought_along_derivatives_of_references_or_of_a_reference_of_the_mechanism():

@@ -9,7 +9,7 @@ import numpy as np
 
 from servoctl.checks import as_span, by_name, finite, interval, mapping, require_kind
 from servoctl.control.extremes import excesses, extremes
-from servoctl.control.time_optimal import Curve, Inverse, Problem, in_formulas, smooth
+from servoctl.control.time_optimal import Curve, Inverse, Problem, smooth
 from servoctl.errors import (
     InconsistentStart,
     IntegrationStopped,
@@ -97,8 +97,8 @@ def fastest(
     ----------
     mechanism : Mechanism
     program : Program
-        With `shape=True` its residuals are h(q) - p(t), or conditions that hold at any speed; they may follow the curve
-        p at any pace, such as `curves.line(q.t, ...)`.
+        With `shape=True` its residuals contain q and references, without derivatives of these, or are conditions that
+        hold at any speed; the references may run along their curve at any pace.
     limits : dict of str to (float, float) or float
         Lower and upper limit of actuators, their rates ("dtrolley") and outputs by name; a number c is (-c, c), None
         leaves a side open.
@@ -188,15 +188,14 @@ def _even(scene, bar):
 
 def _optimal(scene, bar):
     """The time law that is free along the curve: solved within the limits at nodes, and these tightened in between."""
-    program = in_formulas(scene.mechanism.q, scene.program, scene.paths)
-    curve = Curve(scene.mechanism, program, scene.t_span, scene.parameters)
+    curve = Curve(scene.mechanism, scene.program, scene.t_span, scene.paths)
     inverse = Inverse(curve, tuple(scene.limits), scene.parameters, scene.guess)
-    (t0, t1), t = scene.t_span, scene.mechanism.q.t
+    t0, t1 = scene.t_span
 
     @functools.cache
     def attempt(factor):
-        step = rest_to_rest(t - t0, 0.0, 1.0, (t1 - t0) * factor, inverse.order)
-        found = scene.tried(curve.program_along(step), factor)
+        step = rest_to_rest(0.0, 1.0, (t1 - t0) * factor, smoothness=inverse.order, t_start=t0)
+        found = scene.tried(scene.program, factor, curve.paths_along(step, inverse.order))
         bar.update()
         if found[-1] is not None and not found[-1].model.flat:
             require_no_growth(found[-1], *CURVE_GROWS)
@@ -208,12 +207,11 @@ def _optimal(scene, bar):
     sides = limits.copy()
     for _ in range(TIGHTENED):
         law = Problem(inverse, sides, law, plan).solved()
-        excess, binding, program, plan = scene.tried(
-            curve.program_along(law.expression(t, t0)), law.duration / (t1 - t0)
-        )
+        factor, paths = law.duration / (t1 - t0), curve.paths_along(law.path(t0), inverse.order)
+        excess, binding, program, plan = scene.tried(scene.program, factor, paths)
         bar.update()
         if excess <= 0:
-            return TimeLaw(law.duration / (t1 - t0), program, plan if plan.model.flat else judged(plan), binding)
+            return TimeLaw(factor, program, plan if plan.model.flat else judged(plan), binding, paths)
         if plan is None:
             break
         values = np.array([[value for value, _ in extremes(plan, name)] for name in scene.limits]).T

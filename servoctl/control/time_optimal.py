@@ -9,7 +9,8 @@ the duration T, the jets of s at the ends of the intervals, and those of the mot
 Entries of the state that the rows leave free, the internal dynamics, are collocated at the same nodes.
 """
 
-from copy import copy
+from dataclasses import replace
+from functools import partial
 from math import factorial
 
 import casadi as ca
@@ -24,76 +25,85 @@ from servoctl.methods.radau import radau
 from servoctl.model.equations import signal_groups
 from servoctl.model.jets import extended
 from servoctl.model.model import derived
-from servoctl.spec.paths import piecewise
+from servoctl.spec.paths import Path, as_path
+from servoctl.spec.paths.fit import fitted
+from servoctl.spec.references import Jets, function_of, orders_in
 from servoctl.values import frozen
 
-JETS = 14  # s, s', ..., among which are those that the rows contain
 INTERVALS = 80
 COLLOCATION = 5  # of the collocation: three nodes
 REGULAR = 1e-3  # least speed along a curve, of the largest, with which time itself is its parameter
 DEGREES = (1, 2, 4, 8, 12, 16, 20)  # of the polynomial of the arc length that a curve is, or else
 SPLINE = (9, 80)  # the degree and the intervals of its spline
 MISSED = (1e-12, 1e-8)  # of its extent: by which the polynomial, and the spline, may miss it
+FITTED = 1e-7  # error of a derivative of references along a law, of its largest value: rounding of class 6 has 2e-8
 PANELS, GAUSS = 2000, np.polynomial.legendre.leggauss(8)  # of the arc length; of a quadrature in each panel
 LEAST = 1e-4  # duration, relative to that of the first motion
 
 
 class Curve:
-    """The curve of a program: its residuals as functions of a parameter s from 0 to 1.
+    """The curve along which the references of a program run: their values as paths of a parameter s from 0 to 1.
 
-    Residuals are h(q) - p(t), and others that hold along the curve at any speed. `t_span` is (t0, t1) [s], `values` are
-    the parameters that differ from their defaults.
+    `span` is (t0, t1) [s], `paths` are those of the references by name; `pieces` are their paths along s.
     """
 
-    def __init__(self, mechanism, program, t_span, values):
-        self.mechanism, self.program, self.span = mechanism, program, t_span
-        self.moving = self._moving()
-        q, p = mechanism.q, mechanism.parameters
-        offsets = [e - ca.substitute(e, q.t, t_span[0]) for e in self.moving.values()]
-        anywhere = ca.vertcat(*q, *p.symbols), ca.DM([0.5] * q.nq + [*p.values(values)])
-        offsets = ca.substitute(ca.vertcat(*offsets), *anywhere)
-        self._offsets = ca.Function("curve", [q.t], [ca.densify(offsets), ca.densify(ca.jacobian(offsets, q.t))])
-        t = np.linspace(*t_span, PANELS + 1)
-        self.extent = np.ptp(self._along(t)[0], axis=1)
-        if not np.all(self.extent > 0):
-            raise self._refused(list(self.moving)[int(np.argmin(self.extent))], "returns to no other value in the span")
-        speed = self._speed(t)
-        self._pieces = None if speed.min() > REGULAR * speed.max() else self._by_arc_length()
+    def __init__(self, mechanism, program, span, paths):
+        self.mechanism, self.program, self.span = mechanism, program, span
+        self._paths = {name: path.held() for name, path in paths.items()}
+        self._require_curve()
+        t = np.linspace(*span, PANELS + 1)
+        places, rates = self._along(t)
+        extent = np.ptp(places, axis=1)
+        if not extent.any():
+            raise self._refused(f"The path of {next(iter(paths))}", "stands still in the span", next(iter(paths)))
+        self.extent = np.where(extent > 0, extent, 1.0)
+        speed = self._speed(rates)
+        regular = speed.min() > REGULAR * speed.max()
+        self.pieces = self._by_time() if regular else dict(zip(paths, self._by_arc_length(), strict=True))
 
-    def _moving(self):
-        """The residuals that contain the time, by name; refuses what is no curve."""
+    def _require_curve(self):
+        """Refuse what is no curve: it contains the time itself, or prescribes rates."""
         mechanism, q = self.mechanism, self.mechanism.q
         fixed = [mechanism.balance, mechanism.E, q.V, q.h, *mechanism.constraints.values(), *mechanism.outputs.values()]
         chosen = [ca.SX(e) for e in (*self.program.weights.values(), *self.program.toward.values())]
-        if any(ca.depends_on(e, q.t) for e in (*fixed, *chosen)):
-            raise self._refused("the mechanism", "depends on time")
-        moving = {}
+        if any(ca.depends_on(e, q.t) for e in (*fixed, *chosen)) or orders_in(q, [*fixed, *chosen]):
+            raise self._refused("The mechanism", "depends on time", "the mechanism")
         for name, e in self.program.with_turns.items():
-            w, timed = q.jet(1), ca.depends_on(e, q.t)
-            if q.order(e) > 0 and (timed or q.order(e) > 1 or not mechanism.is_zero([ca.jtimes(e, w, w) - e])):
-                raise self._refused(name, "prescribes rates")
-            if timed and ca.depends_on(ca.jacobian(e, q.t), ca.vertcat(*q)):
-                raise self._refused(name, "contains products of the time and the coordinates")
-            if timed:
-                moving[name] = e
-        if not moving:
-            raise self._refused(next(iter(self.program.residuals)), "does not contain the time")
-        return moving
+            w, orders = q.jet(1), orders_in(q, [e])
+            if ca.depends_on(e, q.t):
+                raise self._refused(repr(name), "contains the time itself", name)
+            if rates := [q.family.jet(reference, k).name() for reference, k in orders.items() if k]:
+                raise self._refused(repr(name), f"contains {', '.join(rates)}", name)
+            along = q.order(e) <= 0 or q.order(e) == 1 and not orders and mechanism.is_zero([ca.jtimes(e, w, w) - e])
+            if not along:
+                raise self._refused(repr(name), "prescribes rates", name)
+        if not self._paths:
+            name = next(iter(self.program.residuals))
+            raise self._refused(repr(name), "contains no reference", name)
+        for name, path in self._paths.items():
+            if path.before == "periodic":
+                raise self._refused(f"The path of {name}", "is periodic", name)
 
-    def _refused(self, name, what):
+    def _refused(self, what, why, name):
         return SpecificationError(
-            f"{name!r} {what}." if name in self.program.residuals else f"{name.capitalize()} {what}.",
-            "A time-optimal law runs along a curve, h(q) = p(s); only its time law is open.",
-            do="Write residuals h(q) - p(t), with via points by spline(..., ends='natural'), or choose shape=False.",
+            f"{what} {why}.",
+            "A time-optimal law runs along a curve, values of references from rest to rest; only its law is open.",
+            do="Write residuals of q and references, as x - r.X with r = q.references(X=path), or choose shape=False.",
             name=name,
         )
 
     def _along(self, t):
-        """Places p(t) - p(t0) of the curve (k, N) and their rates."""
-        return tuple(np.array(part) for part in self._offsets.map(len(t))(np.asarray(t, dtype=float)[None]))
+        """Values of the references (k, N) and their rates."""
+        jets = np.concatenate([path.jets(t, 1) for path in self._paths.values()], axis=1)
+        return jets[0], jets[1]
+
+    def _by_time(self):
+        """The paths by name with s = (t - t0)/(t1 - t0)."""
+        (t0, t1), paths = self.span, self._paths.items()
+        return {name: replace(path, breaks=(path.breaks - t0) / (t1 - t0)) for name, path in paths}
 
     def _by_arc_length(self):
-        """Ends of pieces (n + 1,) in s and coefficients (degree + 1, n, k), as for `paths.piecewise`.
+        """The path of all references along the part of the length of their curve.
 
         Polynomials are fitted to the places at the ends of panels of time, whose parts of the length are known.
         """
@@ -101,40 +111,62 @@ class Curve:
 
         panels = np.linspace(*self.span, PANELS + 1)
         t, weights = quadrature(self.span, PANELS)
-        length = np.append(0.0, np.cumsum((self._speed(t) * weights).reshape(PANELS, -1).sum(axis=1)))
+        length = np.append(0.0, np.cumsum((self._speed(self._along(t)[1]) * weights).reshape(PANELS, -1).sum(axis=1)))
         part, places = length / length[-1], self._along(panels)[0].T
         for degree in DEGREES:
             fit = chebyshev.chebfit(2 * part - 1, places, degree)
             if (np.abs(chebyshev.chebval(2 * part - 1, fit).T - places) / self.extent).max() < MISSED[0]:
                 powers = np.array([np.pad(p := chebyshev.cheb2poly(c), (0, degree + 1 - len(p))) for c in fit.T])
-                return np.array([0.0, 1.0]), powers.T[:, None, :]
+                return Path(np.array([0.0, 1.0]), powers[None], np.full(2, np.inf), "continue", "continue")
         degree, count = SPLINE
-        s, half = np.linspace(0.0, 1.0, count + 1), 0.5 / count
+        s = np.linspace(0.0, 1.0, count + 1)
         knots = np.pad(s, degree, mode="edge")
         matrix = BSpline.design_matrix(part, knots, degree).toarray()
         curve = BSpline(knots, np.linalg.lstsq(matrix, places, rcond=None)[0], degree)
         miss = np.abs(curve(part) - places) / self.extent
         if not miss.max() < MISSED[1]:
             k, i = np.unravel_index(np.argmax(miss), miss.shape)
-            raise self._refused(list(self.moving)[i], f"turns sharply at {part[k]:.3g} of the length of its curve")
-        coefficients = [curve(s[:-1] + half, nu=j) / factorial(j) * half**j for j in range(degree + 1)]
-        return s, np.array(coefficients)
+            name = list(self._paths)[i]
+            raise self._refused(f"The path of {name}", f"turns sharply at {part[k]:.3g} of the length", name)
+        return as_path(curve, before="continue", after="continue")
 
-    def _speed(self, t):
-        return np.linalg.norm(self._along(t)[1] / self.extent[:, None], axis=0)
+    def _speed(self, rates):
+        return np.linalg.norm(rates / self.extent[:, None], axis=0)
 
-    def program_along(self, law):
-        """The program whose curve is followed by a law s, an SX scalar from 0 to 1."""
-        q, (t0, t1) = self.mechanism.q, self.span
-        residuals = dict(self.program.with_turns)
-        if self._pieces is None:
-            timed = {name: ca.substitute(e, q.t, t0 + (t1 - t0) * law) for name, e in self.moving.items()}
-        else:
-            offsets = piecewise(law, *self._pieces).elements()
-            begins = (ca.substitute(e, q.t, t0) for e in self.moving.values())
-            timed = dict(zip(self.moving, map(sum, zip(begins, offsets, strict=True)), strict=True))
-        weights, toward = self.program.weights, self.program.toward
-        return self.program.again(residuals | timed, weights, toward)
+    def jets(self, c):
+        """The references and their derivatives, SX by (name, order), of the jets c of a law s of time."""
+        result = {}
+        for name, path in self.pieces.items():
+            breaks, inner = path.breaks, (path.breaks[1:-1] > 0) & (path.breaks[1:-1] < 1)
+            first = int(np.argmax(np.append(inner, True)))
+            rows = slice(first, first + inner.sum() + 1)
+            of_piece = partial(ca.pw_const, c[0], breaks[1:-1][inner]) if inner.any() else lambda row: ca.SX(row[0])
+            middle, half = (breaks[1:] + breaks[:-1]) / 2, np.diff(breaks) / 2
+            tau, value = (c[0] - of_piece(middle[rows])) * of_piece(1 / half[rows]), ca.SX(0)
+            for power in path.coefficients[rows, 0].T[::-1]:
+                value = value * tau + of_piece(power)
+            for k in range(len(c)):
+                result[name, k] = value
+                value = sum(ca.jacobian(value, s) * rate for s, rate in zip(c[: k + 1], c[1 : k + 2], strict=False))
+        return result
+
+    def paths_along(self, law, k):
+        """The paths of the references by name along a law s, a path of time from 0 to 1, of class C^k."""
+
+        def jets(t):
+            s, series = law.jets(t, k)[:, 0, 0] / factorials, np.zeros((k + 1, len(self.pieces)))
+            outer = np.stack([path.jets(s[0], k)[:, 0, 0] for path in self.pieces.values()], axis=1)
+            s[0] = 0.0
+            for d in (outer / factorials[:, None])[::-1]:
+                series = np.array([s[i::-1] @ series[: i + 1] for i in range(k + 1)])
+                series[0] += d
+            return series * factorials[:, None]
+
+        if all(path.coefficients.shape[::2] == (1, 2) for path in self.pieces.values()):
+            return {name: path(0.0) + (path(1.0) - path(0.0)) * law for name, path in self.pieces.items()}
+        factorials = np.array([float(factorial(j)) for j in range(k + 1)])
+        path = fitted(jets, law.breaks, k, FITTED, "hold", "hold")
+        return {name: path[i] for i, name in enumerate(self.pieces)}
 
 
 class Inverse:
@@ -144,13 +176,9 @@ class Inverse:
     """
 
     def __init__(self, curve, signals, values, guess):
-        mechanism = copy(curve.mechanism)
-        mechanism.parameters = mechanism.parameters.extended(**{f"s_{j}": 0.4 * (-0.5) ** j for j in range(JETS)})
-        c, t = mechanism.parameters.symbols[-JETS:], mechanism.q.t
-        law = sum(s * t**j / factorial(j) for j, s in enumerate(c))
-        model = derived(mechanism, curve.program_along(law), guess)
+        model = derived(curve.mechanism, curve.program, guess)
         self.model = model = model.with_parameters(**values) if values else model
-        e, q, top = model.equations, mechanism.q, model.reduction.top
+        e, q, top = model.equations, curve.mechanism.q, model.reduction.top
         found = [self._signal(name) for name in signals]
         size = max([e.jets.numel(), *(f.size1_in(1) for _, f in found)])
         self.extra = (size - e.jets.numel()) // q.n
@@ -161,12 +189,16 @@ class Inverse:
             for row, count in zip(model.reduction.rows, counts, strict=True)
         ]
         rows = ca.vertcat(*q.invariants.values(), *(row for level in levels for row in level))
-        values = ca.vertcat(*(f(t, self.jets[: f.size1_in(1)], e.parameters)[i] for i, f in found))
+        values = ca.vertcat(*(e.called(f, self.jets[: f.size1_in(1)], e.parameters)[i] for i, f in found))
         parts = [ca.vertcat(*(level[-1 - self.extra] for level in levels)), rows, values, e.rates(q.jet(top))]
-        numbers = ca.DM([0.0, *model.parameters[:-JETS]])
-        tops, *parts = ca.substitute(parts, [ca.vertcat(t, *e.parameters.elements()[:-JETS])], [ca.SX(numbers)])
-        self.order, highest = (max(j for j in range(JETS) if ca.depends_on(x, c[j])) for x in (tops, parts[0]))
-        self.c = ca.vertcat(*c[: highest + 1])
+        jets = Jets(q, parts)
+        c = [ca.SX.sym(f"s_{j}") for j in range(1 + max(k for _, k in jets.places))]
+        along = curve.jets(c)
+        numbers = ca.DM([0.0, *model.parameters])
+        parts = ca.substitute(parts, [jets.symbols], [ca.vertcat(*(along[place] for place in jets.places))])
+        tops, *parts = ca.substitute(parts, [ca.vertcat(q.t, e.parameters)], [ca.SX(numbers)])
+        self.order = max(j for j, s in enumerate(c) if ca.depends_on(tops, s))
+        self.c = ca.vertcat(*c)
         self.function = ca.Function("inverse", [self.jets, self.c], [ca.densify(ca.cse(part)) for part in parts])
 
     def _signal(self, name):
@@ -175,41 +207,13 @@ class Inverse:
         e = model.equations
         if name in model.jet_names:
             i = model.jet_names.index(name)
-            return 0, ca.Function("jet", [e.q.t, e.jets, e.parameters], [e.jets[i]])
+            return 0, function_of(e.q, model.reduction.references, "jet", e.jets, e.parameters, e.jets[i])
         groups = signal_groups(model.reduction)
         base, rate = (name, 0) if name in groups else antiderivative(name, groups) or (None, 0)
         if base is None:
             raise unknown(name, [*model.jet_names, *groups], "signal")
         names, f = e.signals(groups[base], rate)
         return names.index(name), f
-
-
-def in_formulas(q, program, paths):
-    """The program with the paths of its references as formulas of time, along which a law is sought."""
-    if not paths:
-        return program
-    expressions = program.with_turns
-    symbols = [s for s in ca.symvar(ca.vertcat(*expressions.values())) if (place := q.where(s)) and place[0] == "r"]
-    names = [q.family.names[q.where(s)[2]] for s in symbols]
-    for symbol, name in zip(symbols, names, strict=True):
-        if q.where(symbol)[1] or "periodic" in (paths[name].before, paths[name].after) or set(paths) != set(names):
-            raise SpecificationError(
-                f"The program contains {symbol.name()}." if q.where(symbol)[1] else f"The path of {name} is periodic.",
-                "A time-optimal law runs along a curve, h(q) = r, of values from one rest to another.",
-                do="Write residuals h(q) - r with paths that end, or choose shape=False.",
-                name=name,
-            )
-    formulas = [_formula(q.t, paths[name]) for name in names]
-    timed = ca.substitute([*expressions.values()], symbols, formulas)
-    return program.again(dict(zip(expressions, timed, strict=True)), program.weights, program.toward)
-
-
-def _formula(t, path):
-    """A path as an expression of time."""
-    low, high = path.breaks[[0, -1]]
-    t = t if path.before == "continue" else ca.fmax(t, low)
-    t = t if path.after == "continue" else ca.fmin(t, high)
-    return piecewise(t, path.breaks, path.coefficients.transpose(2, 0, 1))
 
 
 @frozen
@@ -233,12 +237,12 @@ class Law:
         below = [linear.antiderivative(self.k - j)(parts) for j in range(self.k)]
         return np.array([*below, linear(parts), linear(parts, nu=1)])
 
-    def expression(self, t, t0):
-        """s as an SX of a time that begins at t0 [s]; before and after it rests."""
-        half, times = 0.5 / (len(self.top) - 1), t0 + self.duration * self.ends
-        jets = self.jets(self.ends[:-1] + half)
-        powers = np.array([jet * half**j / factorial(j) for j, jet in enumerate(jets)])
-        return piecewise(ca.fmin(ca.fmax(t, times[0]), times[-1]), times, powers[:, :, None])
+    def path(self, t0):
+        """s as a path that begins at t0 [s]; before and after it rests."""
+        half = 0.5 / (len(self.top) - 1)
+        powers = np.array([jet * half**j / factorial(j) for j, jet in enumerate(self.jets(self.ends[:-1] + half))])
+        classes = np.full(len(self.top), float(self.k))
+        return Path(t0 + self.duration * self.ends, powers.T[:, None], classes, "hold", "hold")
 
 
 def quadrature(edges, panels):

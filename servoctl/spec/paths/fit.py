@@ -50,7 +50,12 @@ def function(f, span, smoothness=4, tolerance=1e-9, *, before=None, after=None):
     """
     k, tolerance = whole_of("smoothness", smoothness, range(MOST_JETS + 1)), positive("tolerance", tolerance)
     require_kind(Callable, "f", f, "def f(t): return value, derivative, ...")
-    edges, told, best = np.array(as_span(span, forward=True)), {}, math.inf
+    return fitted(f, np.array(as_span(span, forward=True)), k, tolerance, before, after)
+
+
+def fitted(f, edges, k, tolerance, before, after):
+    """As `function`, on pieces that are halved from given ones on, whose ends (n + 1,) ascend."""
+    told, best = {}, math.inf
 
     def jets(t):
         told.update((x, _jets_of(f, x, k)) for x in t.tolist() if x not in told)
