@@ -16,6 +16,7 @@ from servoctl.figures.style import write_png
 from servoctl.inversion.verdict import GROWS, MARGINAL, chosen_by, verdict, verdict_with
 from servoctl.methods.bounded import Problem
 from servoctl.methods.choice import ORDERS, Bounded, as_drift, as_method, default_method
+from servoctl.model.following import corners_of
 from servoctl.model.jets import with_highest
 from servoctl.progress import stage
 from servoctl.shell import loop
@@ -129,7 +130,8 @@ def _planned(args, motion, report):
     forward = None if method else _simulate(motion, options)
     try:
         if isinstance(method, Bounded):
-            span = motion.span if args.t_span else (min(t0, *model.knots, t1), max(t0, *model.knots, t1))
+            instants = t0, t1, *corners_of(model)  # the whole path, and the rest on either side of it
+            span = motion.span if args.t_span else (min(instants), max(instants))
             window = Problem(model, span, start.values).window(method.window) if args.samples else span
             whole = replace(motion, span=span)
             return whole, *_simulate(whole, _options(args, model, window) | {"method": method})
