@@ -12,10 +12,9 @@ from conftest import lean
 import servoctl as sv
 from servoctl import gallery
 from servoctl.codegen import emit
-from servoctl.codegen.chains import short_chains, time_of
+from servoctl.codegen.chains import Constant, short_chains, time_of
 from servoctl.codegen.collecting import ways
 from servoctl.codegen.compiler import library
-from servoctl.jets.pieces import Constant
 from servoctl.tolerances import EXTENDED
 
 extended = pytest.mark.skipif(not EXTENDED, reason="what is compared with is computed in extended precision")
@@ -262,7 +261,7 @@ def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):
         off = np.abs(evaluated(some, t, x, p) - exact)[:, finite]
         return (off / np.where(size > 0, size, 1.0)).max(axis=0).astype(float)
 
-    own, reference = error([*itertools.chain(*emit.by_phase(f, nq)[0])]), error(emit._with_reciprocals(given))
+    own, reference = error([*itertools.chain(*emit.by_phase(f, nq))]), error(emit._with_reciprocals(given))
     for some in (np.median, np.max):
         assert some(own) <= 2 * some(reference) + np.finfo(float).eps
 
