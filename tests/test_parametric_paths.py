@@ -274,6 +274,8 @@ def test_parameters_of_paths_that_change_on_the_way_are_refused(supported, crane
     assert np.isfinite(rates).all()
     with refused(SpecificationError, **names):
         system.dynamics(0.5, [0.2, 0.0], [0.0], params=plant.equations.mechanism.parameters.defaults | {"T": 2.0})
+    with refused(SpecificationError, name="X", names=["T"]):
+        sv.minimum_phase(pendulum_on_a_cart(up=True), "T", (0.5, 1.5))
     with refused(SpecificationError, name="X"):
         sv.export_c(crane, tmp_path)
     numbers = {name: crane.numbers[name] for name in ("via_x", "via_z", "T")}

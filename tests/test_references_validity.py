@@ -58,7 +58,7 @@ def test_other_parameters_need_no_extended_precision(make, monkeypatch):
 
 def test_references_that_are_made_later_do_not_matter_to_a_model():
     """Points at which ranks were decided have no jets of these: other parameters are judged at them all the same."""
-    model = cart()
+    model = referred.cart()
     model.reduction.mechanism.q.references(later=None, latest=sv.paths.rest_to_rest(0.0, 1.0, 1.0))
     heavier = model.with_parameters(m=0.2)
     run = sv.simulate(heavier, heavier.start(theta=0.0, dtheta=0.0), (0.0, 0.5))

@@ -41,20 +41,24 @@ class Followed:
 
         They are NaN where a time is none: steps that fail ask for such, and are told by what they get.
         """
-        known = np.isfinite(t)
-        if not known.all():
-            jets = np.full(((order + 1) * len(self.paths), len(t)), np.nan)
-            if known.any():
-                jets[:, known] = self.jets(t[known], order, None if instant is None else instant[known])
-            return jets
         key = tuple(np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
         last, jets = self._last
         size = (order + 1) * len(self.paths)
         if key is None or key != last or len(jets) < size:  # functions ask for one instant again and again
-            rows = [path.jets(t, order, instant)[:, 0] for path in self.paths]
+            rows = [_jets_of(path, t, order, t if instant is None else instant) for path in self.paths]
             jets = np.stack(rows, axis=1).reshape(-1, len(t))
             self._last = (key, jets) if key else self._last
         return jets[:size]
+
+
+def _jets_of(path, t, order, instants):
+    """Derivatives (order + 1, N) of a path, NaN where times (N,) or instants (N,) are not finite, as expressions are."""
+    known = np.isfinite(t) & np.isfinite(instants)
+    if known.all():
+        return path.jets(t, order, instants)[:, 0]
+    jets = np.full((order + 1, len(t)), np.nan)
+    jets[:, known] = path.jets(t[known], order, instants[known])[:, 0]
+    return jets
 
 
 def followed(address):

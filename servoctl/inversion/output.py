@@ -17,7 +17,7 @@ from servoctl.inversion.zeros import NO_COEFFICIENT, ZeroPolynomial
 from servoctl.methods.kinks import SMOOTHER, kink
 from servoctl.model.model import Model, default_start
 from servoctl.model.start import State
-from servoctl.spec.references import function_of
+from servoctl.spec.references import function_of, require_fixed
 from servoctl.tolerances import ENTRY, TINY
 from servoctl.values import frozen
 
@@ -223,7 +223,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     NotRealisable
         If the residuals determine no motion at the equilibrium, for any value.
     SpecificationError
-        For a parameter of nothing but coordinates that the model leaves out.
+        For a parameter of nothing but coordinates that the model leaves out, and for one of paths.
 
     Notes
     -----
@@ -234,6 +234,7 @@ def minimum_phase(model: Model, parameter: str, values, at: State | None = None)
     named(parameter, list(model.numbers), "parameter")
     ends = [finite(parameter, end, "range") for end in interval(parameter, values, "range")]
     _require_program(model)
+    require_fixed(model.paths, model.reduction.mechanism.parameters, [parameter], "Zeros are followed over")
     _require_part(model, parameter)
     at = default_start(model) if at is None else require_kind(State, "at", at, "model.start(...)")
     polynomial, grid = ZeroPolynomial(model, parameter, at), np.linspace(*ends, VALUES)

@@ -44,8 +44,8 @@ def require_class(name, path, needs, span, jumps):
                 name=name,
                 t=at,
             )
-    held = path.held()
-    inside = [t for t in held.breaks_below(needs - (1 if jumps else 0), low, high) if low < t < high]
+    held, least = path.held(), needs - (1 if jumps else 0)
+    inside = [t for t in held.breaks_below(least, low, high) if low < t < high]
     if inside:
         class_ = int(held.classes[np.argmin(np.abs(held.breaks - inside[0]))]) if held.before != "periodic" else None
         has = "" if class_ is None else f", has {f'C^{class_}' if class_ >= 0 else 'a jump'}"
@@ -63,8 +63,9 @@ def require_class(name, path, needs, span, jumps):
 
 def places_of(models):
     """The places in memory (1, N) of the paths of models, (0, N) without references, at which their p begin."""
-    size = 1 if models and models[0].paths else 0
-    return np.reshape([model.p[:size] for model in models], (len(models), size)).T
+    if not (models and models[0].paths):
+        return np.empty((0, len(models)))
+    return np.array([[model._followed.address for model in models]])
 
 
 def p_with(model, parameters):

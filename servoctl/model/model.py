@@ -205,7 +205,10 @@ class Model(Detailed):
         SpecificationError
             For what is no path of one component.
         """
-        paths = other_paths(self.paths, paths)
+        return self._along(other_paths(self.paths, paths))
+
+    def _along(self, paths):
+        """The model along paths of all references by name."""
         return Model(self.reduction, self._store, self.parameters, self._functions, paths=paths)
 
     def _with(self, other, functions, variants=None):

@@ -182,12 +182,11 @@ class _Many:
 
     def paths_of(self, i):
         """The paths of a case, with its parameters, as paths of numbers."""
-        case = {name: plain(column[i]) for name, column in self.columns.items()}
-        paths, known = (
-            {name: column[i] for name, column in self.paths.items()},
-            self.model.reduction.mechanism.parameters,
-        )
-        paths = paths_at(paths, known, known.values(self.model.numbers | case))
+        paths = {name: column[i] for name, column in self.paths.items()}
+        if self.columns:
+            known = self.model.reduction.mechanism.parameters
+            case = {name: plain(column[i]) for name, column in self.columns.items()}
+            paths = paths_at(paths, known, known.values(self.model.numbers | case))
         return {name: path._with() if isinstance(path, PathAt) else path for name, path in paths.items()}
 
     def along(self, which):
@@ -196,7 +195,7 @@ class _Many:
             return [self.model] * len(which)
         for i in which:
             if i not in self.followers:
-                self.followers[i] = self.model.with_references(**self.paths_of(i))
+                self.followers[i] = self.model._along(self.model.paths | self.paths_of(i))
         return [self.followers[i] for i in which]
 
     def numbers(self, which, p):
