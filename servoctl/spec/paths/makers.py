@@ -18,6 +18,10 @@ from servoctl.spec.paths.value import HALVINGS, SAME, SMOOTHEST, Path, cut, requ
 MISSED = 1e-9  # largest distance of a spline from its points, relative to the largest point
 
 
+def _shown(value):
+    return str(value) if isinstance(value, ca.SX) else repr(value)
+
+
 def without_time(maker: Any) -> Any:
     """The maker of a path, which refuses a time in front of its arguments and shows what to write."""
     parameters = [p.replace(kind=p.POSITIONAL_OR_KEYWORD) for p in inspect.signature(maker).parameters.values()]
@@ -30,7 +34,7 @@ def without_time(maker: Any) -> Any:
         except TypeError:
             return maker(*args, **kwargs)
         time, *others = given.items()
-        shown = [(name, text if len(text := str(value)) < 40 else name) for name, value in others]
+        shown = [(name, text if len(text := _shown(value)) < 40 else name) for name, value in others]
         plain = {p.name for p in parameters if p.default is p.empty and p.name not in kwargs}
         line = f"sv.paths.{maker.__name__}({', '.join(x if name in plain else f'{name}={x}' for name, x in shown)})"
         raise SpecificationError(
