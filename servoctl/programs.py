@@ -14,7 +14,6 @@ import casadi as ca
 
 from servoctl.checks import column, mapping, named, positive, require_kind, text
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import cse
 from servoctl.robots.robot import Frame
 from servoctl.spec import rotations
 from servoctl.spec.coordinates import Coordinates
@@ -387,7 +386,7 @@ def wish(mechanism, accelerations=None):
         named(name, names, "coordinate" if q.plain else "quasi-velocity")
         wanted[name] = _scalar(value, f"the acceleration of {name!r}")
     balance = ca.substitute(mechanism.balance, q.jet(2), ca.vertcat(*wanted.values()))
-    forces = cse(inverse @ balance)
+    forces = ca.cse(inverse @ balance)
     return dict(zip(mechanism.actuators, forces.elements(), strict=True))
 
 

@@ -12,10 +12,9 @@ from conftest import lean
 import servoctl as sv
 from servoctl import gallery
 from servoctl.codegen import emit
-from servoctl.codegen.chains import short_chains, time_of
+from servoctl.codegen.chains import Constant, short_chains, time_of
 from servoctl.codegen.collecting import ways
 from servoctl.codegen.compiler import library
-from servoctl.jets.pieces import Constant
 from servoctl.tolerances import EXTENDED
 
 extended = pytest.mark.skipif(not EXTENDED, reason="what is compared with is computed in extended precision")
@@ -31,7 +30,7 @@ def function(*outputs):
 
 def statements(f, chained=True):
     dialect = emit.SCALAR_CHAINED if chained else emit.SCALAR_INLINE
-    return emit._prepared(f, dialect)[0]
+    return emit._prepared(f, dialect)
 
 
 def compiled(f, chained=True):
@@ -155,7 +154,7 @@ def test_like_terms_of_an_elimination_are_collected(scene):
 def test_the_fastest_way_is_taken(scene, number):
     """As measured, of the ways by number: 57, 48, 46, 46; 81, 74, 69, 76; 110, 103, 103, 109; 90, 82, 49, 49 ns a step."""
     f = sv.plant(getattr(gallery, scene)()[0]).function("ode").expression
-    given = emit.tabulated(emit._statements(f, emit.SCALAR_CHAINED))[0]
+    given = emit._statements(f, emit.SCALAR_CHAINED)
     times = [time_of(short_chains(way)) for way in ways(given)]
     assert times.index(min(times)) == number
     assert statements(f) == short_chains(ways(given)[number])
@@ -252,7 +251,7 @@ def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):
     run = sv.simulate(model, model.start(**given.start, guess=given.guess), given.t_span)
     t, x = run.t, run.jets[:nq] * (1 + 1e-4 * rng.normal(size=(nq, len(run.t))))
     p = np.broadcast_to(model.parameters[:, None], (len(model.parameters), len(t)))
-    given = emit.tabulated(emit._statements(f, emit.SCALAR))[0]
+    given = emit._statements(f, emit.SCALAR)
     exact = evaluated(given, t.astype(np.longdouble), x.astype(np.longdouble), p.astype(np.longdouble))
     finite = np.isfinite(exact).all(axis=0)  # elsewhere a pivot is zero
     size = np.abs(exact[:, finite]).max(axis=1, keepdims=True)
@@ -262,7 +261,7 @@ def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):
         off = np.abs(evaluated(some, t, x, p) - exact)[:, finite]
         return (off / np.where(size > 0, size, 1.0)).max(axis=0).astype(float)
 
-    own, reference = error([*itertools.chain(*emit.by_phase(f, nq)[0])]), error(emit._with_reciprocals(given))
+    own, reference = error([*itertools.chain(*emit.by_phase(f, nq))]), error(emit._with_reciprocals(given))
     for some in (np.median, np.max):
         assert some(own) <= 2 * some(reference) + np.finfo(float).eps
 
@@ -311,4 +310,4 @@ def test_vectors_of_a_block_compute_alike():
     text = emit.function_of_several(f, "rates", emit.LANES_INLINE, ("", "1"))
     lines = [line.strip() for line in text[text.index("{\n") :].splitlines()[2:-1]]
     one, other = lines[::2], [re.sub(r"\b([xpya])1(_?)(?=[\[\d])", r"\1\2", line) for line in lines[1::2]]
-    assert len(one) == len(emit._prepared(f, emit.LANES_INLINE)[0]) and one == other
+    assert len(one) == len(emit._prepared(f, emit.LANES_INLINE)) and one == other

@@ -81,6 +81,33 @@ def test_inputs_are_numbers_expressions_paths_or_functions(machine, kind):
     assert ends(run) == pytest.approx(reference(machine, force), abs=1e-7)
 
 
+STEP = sv.paths.polynomials([0.0, 0.7, 2.0], [[0.0, 3.0]])
+PATHS = {"smooth": PUSH, "a step": STEP, "a line": 3.0 * sv.paths.polynomials([0.0, 1.0], [[-1.0], [1.0]], before="continue",
+                                                                            after="continue")}  # fmt: skip
+
+
+@pytest.mark.parametrize("limits", [{}, {"trolley": (-1.0, 2.0)}], ids=["free", "limited"])
+@pytest.mark.parametrize("method", [None, "RK8"])
+def test_inputs_are_paths_which_change_nothing_but_a_table(machine, method, limits):
+    """Pieces between breaks and limits are smooth: SciPy's motions from one to the next are exact."""
+    plant, models = sv.plant(machine.mechanism, limits=limits), []
+    low, high = limits.get("trolley", (-np.inf, np.inf))
+    for path in PATHS.values():
+        run = sv.simulate(plant, START, (0.0, 2.0), method, inputs={"trolley": path})
+        assert run["trolley"] == pytest.approx(np.clip(path(run.t), low, high), abs=1e-14)
+        x, cuts = [*START.values()], np.unique([0.0, *(k for k in run.knots if 0.0 < k < 2.0), 2.0])
+        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+            x = solve_ivp(
+                lambda t, x, b=b, u=path: plant.rates(t, x, [np.clip(u(min(t, b - 1e-12)), low, high)]), (a, b), x, "DOP853",
+                rtol=1e-12, atol=1e-13,
+            ).y[:, -1]  # fmt: skip
+        assert ends(run) == pytest.approx(x, abs=1e-9)
+        assert sv.verify(run).passed
+        models.append(run.model)
+    assert all(model.function("ode") == models[0].function("ode") for model in models), "nothing is compiled for another path"
+    assert machine.mechanism.q.family.paths.keys() <= {"push"}, "the plant's coordinates keep their references"
+
+
 def test_inputs_stay_within_their_limits(machine):
     plant = sv.plant(machine.mechanism, limits={"trolley": (-1.0, 2.0)})
     run = sv.simulate(plant, START, (0.0, 6.0), inputs={"trolley": 5 * ca.sin(machine.mechanism.q.t)})

@@ -15,6 +15,7 @@ from scipy import interpolate as si
 import servoctl as sv
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.spec.paths import Path, as_path, fit, function, polynomials, rest_to_rest, s_curve, spline, trapezoid
+from servoctl.spec.paths.limited import limited
 
 RNG = np.random.default_rng(28)
 TIMES = np.array([0.5, 1.5, 2.0, 4.0, 5.0, 5.7, 6.9, 8.0, 8.6, 9.5, 10.0, 11.2])
@@ -639,3 +640,30 @@ def test_where_a_path_rests_its_derivatives_are_zero_to_the_last_bit():
     path = there.then(rest_to_rest(3**0.5, 12**0.5, duration=3.0))
     jets = path.jets([0.0, 4.0, 7.0], 5)[:, 0]
     assert not jets[1:5].any() and (jets[5] != 0.0).all() and jets[0].tolist() == [0.0, 3**0.5, 12**0.5]
+
+
+@pytest.mark.parametrize("outside", ["hold", "continue", "periodic"])
+@pytest.mark.parametrize("sides", [(-1.0, 2.0), (-np.inf, 0.5), (0.3, np.inf)])
+def test_within_limits_a_path_is_cut_off_exactly(outside, sides):
+    rng, t = np.random.default_rng(1), np.linspace(-3.0, 5.0, 2001)
+    path = polynomials([0.0, 0.5, 1.3, 2.0], 3.0 * rng.normal(size=(5, 3)), before=outside, after=outside)
+    found = limited(path, *sides)
+    assert np.abs(found(t) - path(t).clip(*sides)).max() < 1e-12 and found.classes.min() >= -1
+
+
+Q = sv.coordinates("x")
+OLD = {
+    "rest_to_rest": (lambda: rest_to_rest(Q.t, 0.0, 5.0, duration=6.0), "sv.paths.rest_to_rest(0.0, 5.0, duration=6.0)"),
+    "of numbers": (lambda: rest_to_rest(0.5, 0.0, 5.0, 6.0, 4), "sv.paths.rest_to_rest(0.0, 5.0, 6.0, smoothness=4)"),
+    "spline": (lambda: spline(Q.t, [0, 1], [0, 2], ends="natural"), "sv.paths.spline([0, 1], [0, 2], ends='natural')"),
+    "trapezoid": (lambda: trapezoid(t=Q.t, distance=1.0, duration=6.0, ramp=1.0), "distance=1.0, duration=6.0, ramp=1.0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OLD)
+def test_a_time_before_the_other_arguments_is_refused_with_the_line_to_write(name):
+    make, line = OLD[name]
+    with refused(SpecificationError, line, "q.references(X="):
+        make()
+    with pytest.raises(TypeError, match="smothness"):
+        rest_to_rest(0.0, 5.0, 6.0, smothness=4)

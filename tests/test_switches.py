@@ -163,6 +163,17 @@ def test_other_switches_agree_with_events(name, method):
     assert len(run.knots) > 1 and np.abs(run["y"] - reference).max() < 3e-8
 
 
+@pytest.mark.parametrize("method", ["Taylor", "RK8", "RadauIIA"])
+def test_a_kink_of_a_reference_is_met(method):
+    """x'' = max(t - 1, 0): x' = 1/2 and x = 1/6 at t = 2, which steps that end at t = 1 give; others are 1e-10 off."""
+    q = sv.coordinates("x")
+    path = sv.paths.polynomials([0.0, 2.0], [[1.0], [-1.0]])
+    wind = ca.fmax(q.references(W=path).W, 0)
+    plant = sv.plant(sv.Mechanism(q, gibbs=q.d(2)[0] ** 2 / 2, forces={"x": wind}, actuators={"F": q[0]}))
+    run = sv.simulate(plant, [0.0, 0.0], (0.0, 2.0), method)
+    assert [run["dx"][-1], run["x"][-1]] == pytest.approx([1 / 2, 1 / 6], abs=1e-12)
+
+
 def test_nested_kinks_and_kinks_at_once():
     """| |y| - 1 | of y = 2 cos t: kinks at y = ±1 and at y = 0; a force that depends on it twice."""
     model, start = beside(lambda t, y, dy: -y + 1e-13 * ca.fabs(ca.fabs(y) - 1) * ca.sign(y), y=2.0, dy=0.0)

@@ -10,10 +10,9 @@ import heapq
 import itertools
 import math
 from collections import Counter, defaultdict
+from typing import NamedTuple
 
 import casadi as ca
-
-from servoctl.jets.pieces import Constant, operand_values
 
 CYCLES = defaultdict(
     lambda: 40,
@@ -33,6 +32,17 @@ RECIPROCAL = 2  # operations that take as long as the unit for divisions is occu
 _FACTORS_OF = {ca.OP_SQ: lambda a: (a, a), ca.OP_TWICE: lambda a: (Constant(2.0), a), ca.OP_MUL: lambda a, b: (a, b)}
 _SIGNS = {ca.OP_ADD: (1.0, 1.0), ca.OP_SUB: (1.0, -1.0), ca.OP_NEG: (-1.0,)}
 _CIRCULAR = {ca.OP_SIN, ca.OP_COS}
+
+
+class Constant(NamedTuple):
+    """An operand that is a number."""
+
+    value: float
+
+
+def operand_values(operands):
+    """The values among operands."""
+    return [v for v in operands if isinstance(v, int)]
 
 
 def short_chains(statements):

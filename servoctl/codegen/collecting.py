@@ -13,7 +13,7 @@ from collections import Counter
 
 import casadi as ca
 
-from servoctl.jets.pieces import Constant, operand_values
+from servoctl.codegen.chains import Constant, operand_values
 
 PAIRED = 8  # sums among a sum's factors: of more of them no two are multiplied out together, which takes longest
 ADDED = (0, 1, 2)  # terms by which a sum may grow where another is multiplied out: the fastest result is taken

@@ -68,8 +68,6 @@ def library(text, level="-O1", exact=False, calls=math.inf):
     which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is at
     most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
     """
-    from servoctl.codegen.tables import bind  # imports NumPy and CasADi, which are not needed to name the compiler
-
     command, identity = _compiler()
     if command is None:
         chosen = os.environ.get("SERVOCTL_COMPILER") == "none" or not worth_compiling(calls)
@@ -86,8 +84,6 @@ def library(text, level="-O1", exact=False, calls=math.inf):
             if found is None and not worth_compiling(calls):
                 return None
             _loaded[key] = found or _build(text, flags, f"{key}.so", command)
-            if _loaded[key] is not None:
-                bind(_loaded[key], text)
         return _loaded[key]
 
 

@@ -8,20 +8,18 @@ values have the same divisor, such as a pivot, they are multiplied with its reci
 eight products. This rounds twice instead of once.
 """
 
+import math
 from collections import Counter
 from dataclasses import field, replace
 from itertools import chain, count
 
 import casadi as ca
 
-from servoctl.codegen.chains import short_chains, time_of
+from servoctl.codegen.chains import Constant, short_chains, time_of
 from servoctl.codegen.collecting import collected, ways
 from servoctl.codegen.loops import CONSTANTS, INLINE_SINES, LOOPS, PHASED
 from servoctl.codegen.paths import BY_INSTANT, jets_in
-from servoctl.codegen.tables import Entry, Row, literal, lookup_operation, lookup_text, tabulated
 from servoctl.jets.branches import apply_code
-from servoctl.jets.lookup import lookup_at, lookups
-from servoctl.jets.pieces import Constant
 from servoctl.values import frozen
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
@@ -52,8 +50,8 @@ _ELEMENTARY = {getattr(ca, f"OP_{name.upper()}"): (name, 1) for name in _UNARY}
 _ELEMENTARY |= {getattr(ca, f"OP_{name.upper()}"): (name, 2) for name in _BINARY} | {ca.OP_CONSTPOW: ("pow", 2)}
 _COPIES = {ca.OP_ASSIGN, ca.OP_LIFT}  # the first operand, unchanged
 _NOT_ARITHMETIC = {ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT, *_COPIES}
-EMITTED = frozenset({*_ARITHMETIC, *_ELEMENTARY, *_NOT_ARITHMETIC, ca.OP_CALL})  # what has a C counterpart
-SAME_BITS = EMITTED - {ca.OP_CALL, ca.OP_ERFINV}  # what C evaluates as CasADi does, point by point
+EMITTED = frozenset({*_ARITHMETIC, *_ELEMENTARY, *_NOT_ARITHMETIC})  # what has a C counterpart
+SAME_BITS = EMITTED - {ca.OP_ERFINV}  # what C evaluates as CasADi does, point by point
 
 _FORMS_OF_ONE = {
     "sign": "({0} < 0 ? -1 : {0} > 0 ? 1 : {0})",
@@ -80,7 +78,7 @@ class Dialect:
     common: bool = False  # whether all lanes share p, an array of double
     linkage: str = ""  # of the function and its chunks; without one, chunks are static and not inlined
     exact: bool = False  # whether operations are those of CasADi, one by one, without shared reciprocals
-    whole: bool = False  # whether the text holds the numbers of large tables and paths; else loading sets them
+    whole: bool = False  # whether the text holds the numbers of paths; else p has their place in memory
     chained: bool = False  # whether each evaluation waits for the last: one chunk has the statements of `short_chains`
     collected: bool = False  # whether like terms of these are collected before
 
@@ -95,8 +93,6 @@ class Dialect:
 
     def expression(self, operation, operands):
         """C text of an operation on operands."""
-        if isinstance(operation, (Row, Entry)):
-            return operation.text(self.prefix, *operands)
         if operation in _ARITHMETIC:
             return _ARITHMETIC[operation].format(*operands, one=self.constant(1.0), two=self.constant(2.0))
         name, n = _ELEMENTARY[operation]
@@ -131,19 +127,18 @@ LANES_COMMON = Dialect("W", "ALL({})", "w_", common=True, linkage="static ")
 
 def operations(f):
     """Number of arithmetic operations of an SX function in C: all but constants, inputs, outputs and copies."""
-    return sum(isinstance(target, int) for target, _, _ in tabulated(_statements(f, SCALAR))[0])
+    return sum(isinstance(target, int) for target, _, _ in _statements(f, SCALAR))
 
 
 def cost(f, dialect):
     """The time of a function in a dialect, in operations; see `time_of`."""
-    return time_of(_prepared(f, dialect)[0])
+    return time_of(_prepared(f, dialect))
 
 
 def other_ways(f):
     """Outputs equal to that of a short SX function (t, x, p) but for rounding, with like terms collected."""
     statements = _statements(f, SCALAR)
-    lookups = any(not isinstance(operation, int) for _, operation, _ in statements)
-    if lookups or len(statements) > CHUNK:
+    if len(statements) > CHUNK:
         return []
     inputs = dict(zip("txpw", map(ca.vec, f.sx_in()), strict=False))
     return [_of_statements(way, inputs) for way in ways(statements)[1:]]
@@ -243,6 +238,14 @@ def definitions(sizes):
     }
 
 
+def literal(value):
+    """A number as C text, exactly."""
+    if math.isnan(value):
+        return "NAN"
+    text = "INFINITY" if math.isinf(value) else repr(abs(value))
+    return f"(-{text})" if math.copysign(1.0, value) < 0 else text
+
+
 def include(name):
     """C line that includes a file."""
     return f'#include "{name}"\n'
@@ -250,27 +253,27 @@ def include(name):
 
 def function(f, name, dialect=SCALAR, chunk=CHUNK):
     """C text of one function y = f(t, x, p), cut into chunks of at most `chunk` statements."""
-    statements, tables = _prepared(f, dialect)
+    statements = _prepared(f, dialect)
     chunks, first, jets = _cut(statements, chunk), jets_in(f), _jets_line(f, dialect)
     if len(chunks) == 1:
         jets = f"    {dialect.number} w[{first}];\n{jets}" if first else ""
-        return "".join((*tables, dialect.head(name), jets, *(_line(s, dialect) for s in statements), "}\n"))
+        return "".join((_paths(f, dialect), dialect.head(name), jets, *(_line(s, dialect) for s in statements), "}\n"))
     names = [f"{name}_{here}" for here in range(len(chunks))]
     text, size = _sharing(names, chunks, [0] * len(chunks), dialect, first)
     work = f"    {dialect.number} w[{size}];\n{jets}"
-    return "".join(tables) + text + dialect.head(name) + work + _calls(names) + "}\n"
+    return _paths(f, dialect) + text + dialect.head(name) + work + _calls(names) + "}\n"
 
 
 def by_phase(f, step):
-    """The statements of a function in each of the `PHASES`, and C texts of their tables.
+    """The statements of a function in each of the `PHASES`.
 
     Where Newton's method evaluates the first `step` outputs, like terms are collected, if that is faster.
     """
-    statements, tables = tabulated(_statements(f, SCALAR))
+    statements = _statements(f, SCALAR)
     some = [_by_phase(_with_reciprocals(statements), step)]
     if step and len(statements) <= COLLECTED:
         some.append(_by_phase(collected(statements), step))
-    return min(some, key=_time_of_newton), tables
+    return min(some, key=_time_of_newton)
 
 
 def _time_of_newton(phases):
@@ -286,8 +289,7 @@ def phases(f, name, given, dialect=SCALAR, chunk=CHUNK):
     ``name_rest`` the other outputs. At one instant, corrections of several x may precede the rest, which completes
     the last one.
     """
-    statements, tables = given
-    return "".join(_with_lookups(tables, f, dialect)) + _in_phases(f, name, PHASES, statements, dialect, chunk)
+    return _paths(f, dialect) + _in_phases(f, name, PHASES, given, dialect, chunk)
 
 
 def series(f, name, dialect=SCALAR, chunk=CHUNK):
@@ -295,14 +297,13 @@ def series(f, name, dialect=SCALAR, chunk=CHUNK):
 
     ``name_still`` computes what depends on p alone, ``name_moving`` the outputs.
     """
-    statements, tables = _prepared(f, dialect)
     still, parts = set(), ([], [])
-    for statement in statements:
+    for statement in _prepared(f, dialect):
         target, _, operands = statement
         alone = isinstance(target, int) and all(_is_still(v, still) for v in operands)
         still.update([target] if alone else [])
         parts[not alone].append(statement)
-    return "".join(tables) + _in_phases(f, name, SERIES, parts, dialect, chunk)
+    return _paths(f, dialect) + _in_phases(f, name, SERIES, parts, dialect, chunk)
 
 
 def _is_still(operand, still):
@@ -331,34 +332,32 @@ def _in_phases(f, name, phases, parts, dialect, chunk):
 
 def function_of_several(f, name, dialect, suffixes):
     """C text of y = f(t, x, p) for each suffix of x, p, y, with alternating statements: the processor overlaps them."""
-    copies, tables = zip(*(_prepared(f, dialect, suffix) for suffix in suffixes), strict=True)
+    copies = [_prepared(f, dialect, suffix) for suffix in suffixes]
     lines = (
         _line(statement, dialect, f"a{suffix}_")
         for statements in zip(*copies, strict=True)
         for suffix, statement in zip(suffixes, statements, strict=True)
     )
-    return "".join((*tables[0], dialect.head(name, suffixes), *lines, "}\n"))
+    return "".join((dialect.head(name, suffixes), *lines, "}\n"))
 
 
 def _prepared(f, dialect, suffix=""):
-    """The statements of a function, with lookups and reciprocals, and C texts of what the lookups need."""
-    statements, tables = tabulated(_statements(f, dialect, suffix))
+    """The statements of a function, with reciprocals."""
+    statements = _statements(f, dialect, suffix)
     if not dialect.exact:
         chained = dialect.chained and len(statements) <= CHUNK
         some = ways(statements) if chained and dialect.collected else [statements]
         statements = min(map(short_chains, some), key=time_of) if chained else _with_reciprocals(statements)
-    return statements, _with_lookups(tables, f, dialect)
+    return statements
 
 
-def _with_lookups(tables, f, dialect):
-    """C texts of tables and of what the lookups of a function need."""
-    tables = tables + [lookup_text(lookup, dialect.whole) for lookup in lookups(f)]
-    texts = [include("table_lanes.h" if dialect.prefix else "table.h"), *tables] if tables else []
+def _paths(f, dialect):
+    """C text by which a function takes jets from paths in memory, if any."""
     if not jets_in(f) or dialect.whole:
-        return texts
+        return ""
     name = f"{dialect.prefix.upper()}PATH_JETS"
     once = f"#ifndef HAS_{name}_{(order := _highest(f))}\n#define HAS_{name}_{order}\n{name}({order})\n#endif\n"
-    return [*texts, include("path_lanes.h" if dialect.prefix else "path.h"), once]
+    return include("path_lanes.h" if dialect.prefix else "path.h") + once
 
 
 def _highest(f):
@@ -385,7 +384,7 @@ def _statements(f, dialect, suffix=""):
 
     Values are numbered; inputs and outputs are C text.
     """
-    register, statements, values, looked_up = {}, [], 0, set()
+    register, statements, values = {}, [], 0
     for k in range(f.n_instructions()):
         operation, source, target = f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
         if operation == ca.OP_INPUT:
@@ -394,12 +393,9 @@ def _statements(f, dialect, suffix=""):
             register[target[0]] = Constant(f.instruction_constant(k))
         elif operation == ca.OP_OUTPUT:
             statements.append((f"y{suffix}[{target[1]}]", ca.OP_ASSIGN, (register[source[0]],)))
-        elif _copies(operation, source) or (operation == ca.OP_FLOOR and register[source[0]] in looked_up):
+        elif _copies(operation, source):
             register[target[0]] = register[source[0]]
         else:
-            if operation == ca.OP_CALL:
-                operation = lookup_operation(lookup_at(f, k))
-                looked_up.add(values)
             statements.append((values, operation, tuple(register[i] for i in source)))
             register[target[0]] = values
             values += 1

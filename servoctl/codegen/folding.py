@@ -5,7 +5,6 @@ import math
 import casadi as ca
 
 from servoctl.jets.branches import apply_code
-from servoctl.jets.lookup import lookup_at
 
 _OF_ONE = {ca.OP_ASSIGN: 1.0, ca.OP_NEG: -1.0, ca.OP_TWICE: 2.0}
 
@@ -27,7 +26,6 @@ def folded(f):
         elif operation == ca.OP_OUTPUT:
             outputs[target[1]] = _product(work[source[0]])
         else:
-            operation = lookup_at(f, k) if operation == ca.OP_CALL else operation
             work[target[0]] = _operation(operation, [work[i] for i in source])
     return ca.vertcat(*outputs)
 

@@ -17,7 +17,6 @@ import numpy as np
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.interpreted import BLOCK, Interpreter, restored, restored_grid, weighted
 from servoctl.codegen.native import Library, builtin
-from servoctl.codegen.tables import BOUND
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import contains
 
@@ -85,7 +84,7 @@ class Compiled:
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
         travels = self.loops and "_library" not in vars(self) and not self._too_long and compiler.compiler() is not None
         text = self.source() if travels else ""
-        state = {"_text": None if not text or BOUND in text else text}
+        state = {"_text": text or None}
         return Compiled, parts, state | ({"operations": self.operations} if self.loops else {})
 
     def __eq__(self, other):

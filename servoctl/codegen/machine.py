@@ -19,7 +19,7 @@ ENOUGH = 4  # points that are worth a block: CasADi evaluates fewer of them one 
 def machine(f, calls):
     """The `Machine` of an SX function (t, x, p) -> y; None without a compiler, or where an operation is no arithmetic.
 
-    Tables are looked up for each point by itself, and CasADi has its own approximation of the inverse error function.
+    CasADi has its own approximation of the inverse error function.
     """
     used = {f.instruction_id(k) for k in range(f.n_instructions())}
     if not used <= emit.SAME_BITS or (library := _operations(calls)) is None:

@@ -7,7 +7,6 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.control.law import Law
-from servoctl.jets.branches import cse
 
 
 def law_step(name, t, x, column, outputs):
@@ -15,7 +14,7 @@ def law_step(name, t, x, column, outputs):
 
     `t`, `x` and `column` are symbols, `outputs` expressions of them: command, next controller state, further signals.
     """
-    y = ca.densify(cse(ca.vertcat(*outputs)))
+    y = ca.densify(ca.cse(ca.vertcat(*outputs)))
     return compiled(ca.Function(name, [t, x, column], [y], ["t", "x", "p"], ["y"]), name, ("law",))
 
 

@@ -22,7 +22,6 @@ from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest_along
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError
-from servoctl.jets.branches import cse
 from servoctl.markup import Shown
 from servoctl.plants.plant import Plant
 from servoctl.spec.references import Jets
@@ -64,7 +63,7 @@ class Effects:
             )
         self.immediate = {name for i, name in enumerate(self.names) if slopes[i, :].nnz()}  # an input changes these
         still = ca.substitute(values, e.u, ca.SX.zeros(e.u.numel()))
-        parts = ca.densify(cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
+        parts = ca.densify(ca.cse(ca.vertcat(still, ca.vec(ca.densify(slopes)))))
         self.jets = Jets(e.q, [parts], paths)
         numbers = ca.vertcat(e.p[: e.p.numel() - e.u.numel() - e.q.n], self.jets.symbols)
         self.expression = ca.Function("effects", [e.q.t, e.state, numbers], [parts])

@@ -9,7 +9,6 @@ from servoctl.checks import named, rows_read
 from servoctl.codegen.function import compiled
 from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError, unknown
-from servoctl.jets.branches import cse
 from servoctl.spec.references import Jets, function_of, orders_in
 
 
@@ -86,7 +85,7 @@ class Residuals:
         """A compiled function of (t, states, p), with accelerations below the states for order 2."""
         if name not in self._built:
             x = ca.vertcat(self._state, *(self._q.gamma(2) if self._order > 1 else ()))
-            y, p = ca.densify(cse(ca.vertcat(*outputs()))), self.symbols[: len(self.symbols) - len(self.jets)]
+            y, p = ca.densify(ca.cse(ca.vertcat(*outputs()))), self.symbols[: len(self.symbols) - len(self.jets)]
             f = function_of(self._q, self._names, name, x, ca.vertcat(ca.SX(0, 1), *p), y)
             self._built[name] = compiled(f, name)
         return self._built[name]

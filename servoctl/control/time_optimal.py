@@ -30,7 +30,7 @@ from servoctl.spec.paths.fit import fitted
 from servoctl.spec.references import Jets, function_of, orders_in
 from servoctl.values import frozen
 
-INTERVALS = 80
+INTERVALS = 80  # of a law: its highest derivative is linear on each
 COLLOCATION = 5  # of the collocation: three nodes
 REGULAR = 1e-3  # least speed along a curve, of the largest, with which time itself is its parameter
 DEGREES = (1, 2, 4, 8, 12, 16, 20)  # of the polynomial of the arc length that a curve is, or else

@@ -18,7 +18,6 @@ from servoctl.errors import SpecificationError
 from servoctl.export.files import Array, Constant, Contents, Routine, Scalar, identifier, write
 from servoctl.export.references import references_of
 from servoctl.inversion.verdict import GROWS, HYPERBOLIC_ZEROS, verdict
-from servoctl.jets.lookup import lookups
 from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.reduction.reduce import require_outputs
@@ -33,7 +32,6 @@ IN_FLOATS = {  # corrections that end it, at once and where they no longer fall;
     "MET": 1e-4,
     "GIVEN_WAY": 1e-4,
 }
-COUNTED = 16777216  # 2^24: whole numbers up to it are floats
 LARGEST_CONDITION = 1e5  # of the metric of an allocation in floats, which have seven digits
 TIME = Scalar("t")
 FINITE = "Returns 0, or -1 if a time or an answer is no finite number: nothing is then changed."
@@ -132,7 +130,6 @@ def export_c(
     contents = _of_law(source, thinned) if law else _of_model(source, start, argument, real)
     if real == "float":
         _require_condition(source)
-        _require_counted(contents)
         contents.sizes.update({key: value for key, value in IN_FLOATS.items() if key in contents.sizes})
     return write(folder, name, contents, real)
 
@@ -181,20 +178,6 @@ def _require_condition(source):
             do='Export it with real="double", or pass weights nearer to each other in place of a priority.',
             law=source.name,
             condition=condition,
-        )
-
-
-def _require_counted(contents):
-    """Refuse tables of spline data with more places than floats count."""
-    tables = {table for f in contents.functions.values() for table in lookups(f)}
-    most = max((len(table.numbers) for table in tables), default=0)
-    if most > COUNTED:
-        raise SpecificationError(
-            f"A spline of the program has a table of {most} numbers.",
-            f"A float counts the places of at most {COUNTED} numbers: beyond it leaves some out.",
-            do='Export it with real="double", or thin out the knots of the spline.',
-            numbers=most,
-            most=COUNTED,
         )
 
 

@@ -179,7 +179,6 @@ def _enum(name, array):
 
 def _source(name, contents):
     functions = "".join(emit.function(f, key, emit.EXPORTED) for key, f in contents.functions.items())
-    table = emit.include("table.h")
     inverse = any(contains(f, ca.OP_ERFINV) for f in contents.functions.values())
     parts = [
         f'/* {name}.c: written by servoctl {_version()}. C99; link with -lm. */\n#include "{name}.h"\n',
@@ -188,7 +187,7 @@ def _source(name, contents):
         *(f"\n{c.declaration(name)} = {c.text};\n" for c in contents.constants),
         f"\n{source('inverse_erf.h')}" if inverse else "",
         contents.before,
-        functions.replace(table, source("table.h"), 1).replace(table, ""),
+        functions,
         *map(text_of, contents.sources),
         *(routine.definition(name) for routine in contents.routines),
     ]

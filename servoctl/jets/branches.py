@@ -12,7 +12,6 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.lookup import Lookup, lookup_at, made
 from servoctl.tolerances import LAST_EXPONENT
 
 _SIDES = {
@@ -75,7 +74,7 @@ class Branches:
         """SX scalars with branches as parameters; atan2 stays as it is, or is a continuous angle if `angles`."""
         if not expressions:
             return []
-        merged = ca.densify(cse(ca.vertcat(*expressions)))
+        merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
         if not has_switches(merged):
             return merged.elements()
         work, original, moves = [], [], []  # smooth values, the same with their decisions, whether these may change
@@ -162,7 +161,7 @@ def without_turns(expression):
         angles.append((ca.SX.sym(f"angle_{len(angles)}"), *arguments))
         return angles[-1][0]
 
-    (whole,) = replayed([cse(expression)], work, lambda leaf, symbol: leaf, value)
+    (whole,) = replayed([ca.cse(expression)], work, lambda leaf, symbol: leaf, value)
     slopes = [ca.simplify(ca.jacobian(whole, angle)) for angle, *_ in angles]
     if not all(c.is_constant() for c in slopes) or all(c.is_zero() for c in slopes):
         return expression
@@ -279,36 +278,6 @@ def sizes_of_terms(expressions):
     return replayed(expressions, sizes, leaf, size)
 
 
-def cse(expression):
-    """An SX matrix whose equal operations are one (common subexpression elimination)."""
-    if not made:
-        return ca.cse(expression)
-    values, marks = _marked(expression.nonzeros())
-    if not marks:
-        return ca.cse(expression)
-    work, by_mark = [], {mark.element_hash(): lookup for lookup, mark in marks.items()}
-
-    def value(op, operands):
-        first, *others = (work[i] for i in operands)
-        lookup = op == ca.OP_FMOD and by_mark.get(others[0].element_hash())
-        return lookup.called(first) if lookup else apply_code(op, first, *others)
-
-    merged = replayed(ca.cse(ca.vertcat(*values)).elements(), work, lambda leaf, symbol: leaf, value)
-    return ca.SX(expression.sparsity(), ca.vertcat(*merged))
-
-
-def as_text(f):
-    """Text of an SX function, which is equal for equal functions alone."""
-    if not made or not contains(f, ca.OP_CALL):
-        return f.serialize()
-    outputs = f.call(f.sx_in())
-    values, marks = _marked([e for y in outputs for e in y.nonzeros()])
-    shapes = [[y.shape, *y.sparsity().get_triplet()] for y in outputs]
-    names = sorted(marks, key=str)
-    whole = ca.Function("text", [*f.sx_in(), *(marks[lookup] for lookup in names)], [ca.vertcat(*values)])
-    return f"{f.name()} {list(map(str, names))} {shapes}\n{whole.serialize()}"
-
-
 def replayed(expressions, work, leaf, value):
     """The outputs of expressions whose operations are taken one by one; `work` receives all values in their order.
 
@@ -325,28 +294,13 @@ def replayed(expressions, work, leaf, value):
         elif op == ca.OP_CONST:
             work.append(leaf(ca.SX(f.instruction_constant(k)), False))
         else:
-            work.append(value(lookup_at(f, k) if op == ca.OP_CALL else op, operands))
+            work.append(value(op, operands))
     return outputs
 
 
 def apply_code(op, *operands):
-    """The operation of CasADi with a code, or a lookup, of SX scalars."""
-    if isinstance(op, Lookup):
-        return op.called(*operands)
+    """The operation of CasADi with a code, of SX scalars."""
     return ca.SX.unary(op, *operands) if len(operands) == 1 else ca.SX.binary(op, *operands)
-
-
-def _marked(expressions):
-    """SX scalars with an operation on a symbol in place of each lookup, and the symbols by lookup."""
-    work, marks = [], {}
-
-    def value(op, operands):
-        arguments = [work[i] for i in operands]
-        if not isinstance(op, Lookup):
-            return apply_code(op, *arguments)
-        return ca.fmod(*arguments, marks.setdefault(op, ca.SX.sym(op.name)))
-
-    return replayed(expressions, work, lambda leaf, symbol: leaf, value), marks
 
 
 def _words(expression):

@@ -7,7 +7,7 @@ holds where the expression is bounded in e^s, as its degree in e^s shows; log(1 
 
 import casadi as ca
 
-from servoctl.jets.branches import apply_code, cse, replayed
+from servoctl.jets.branches import apply_code, replayed
 from servoctl.tolerances import LAST_EXPONENT
 
 _GROWING = {ca.OP_EXP, ca.OP_EXPM1, ca.OP_SINH, ca.OP_COSH}
@@ -130,7 +130,7 @@ def settled(expressions):
     """
     if not expressions or not _has_growing(expressions):
         return expressions
-    merged = ca.densify(cse(ca.vertcat(*expressions))).elements()
+    merged = ca.densify(ca.cse(ca.vertcat(*expressions))).elements()
     ways = [_Degrees(direction) for direction in (1, -1)]
     ends = [way.bounded(replayed(merged, [], way.leaf, way.value)) for way in ways]
     return _rewritten(merged, ways, ends) if any(ends) else expressions

@@ -15,8 +15,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SpecificationError
-from servoctl.jets.lookup import Lookup, lookup_at
-from servoctl.tolerances import LAST_EXPONENT
 
 REAL = np.longdouble
 JETS = 40  # highest derivative of a reference that rows may contain: chains of a dozen cars and springs need 30
@@ -167,16 +165,15 @@ class Tape:
     """The primitive operations that compute `expressions`, SX scalars.
 
     `symbols` are the inputs in the order of their values, by default all symbols of the expressions. Each node takes
-    nodes before it, except the slopes of "quad" nodes; `outputs` are the nodes of the expressions, and `switches` pairs
-    of nodes whose difference decides a branch by its sign, (node, None) for a node itself. Raises SpecificationError
-    for an operation that has no derivative (floor, fmod, ...).
+    nodes before it, except the slopes of "quad" nodes; `outputs` are the nodes of the expressions. Raises
+    SpecificationError for an operation that has no derivative (floor, fmod, ...).
     """
 
     def __init__(self, symbols, expressions):
         function = ca.Function("tape", [], list(expressions), _OPTIONS)
         free = function.free_sx()
         self.symbols = list(free if symbols is None else symbols)
-        self.nodes, self.switches, self._pairs = [], [], {}
+        self.nodes, self._pairs = [], {}
         inputs = {s.element_hash(): self._add("input", data=i) for i, s in enumerate(self.symbols)}
         self.outputs = [None] * len(expressions)
         self._read(function, [inputs[s.element_hash()] for s in free])
@@ -241,27 +238,17 @@ class Tape:
                 work.append(next(symbols))
             elif op == ca.OP_CONST:
                 work.append(self._add("const", data=function.instruction_constant(k)))
-            elif op == ca.OP_CALL:
-                work.append(self._add("constant", *(work[i] for i in operands(k)), data=lookup_at(function, k)))
-            elif op == ca.OP_FLOOR and isinstance(nodes[work[operands(k)[0]]].data, Lookup):
-                work.append(work[operands(k)[0]])
             else:
                 work.append(self._operation(op, [work[i] for i in operands(k)]))
 
     def _operation(self, op, a):
         if op in _BINARY:
-            if op in (ca.OP_FMIN, ca.OP_FMAX):
-                self._switch(a[0], a[1])
             return self._add(_BINARY[op], a[0], a[1])
         if op in _UNARY:
-            if op == ca.OP_FABS:
-                self.switches.append((a[0], None))
             return self._add(_UNARY[op], a[0])
         if op == ca.OP_COPYSIGN and a[0] == a[1]:  # the sign of itself: by it conditions of branches stay in place
             return a[0]
         if op in _CONSTANT:
-            if op in (ca.OP_LT, ca.OP_LE, ca.OP_SIGN):
-                self._switch(a[0], a[1] if op != ca.OP_SIGN else None)
             return self._add("constant", *a[: 1 if op in (ca.OP_NOT, ca.OP_SIGN) else 2], data=_CONSTANT[op])
         if op == ca.OP_TWICE:
             return self._add("scale", a[0], data=2.0)
@@ -284,12 +271,6 @@ class Tape:
             do="Use if_else, fmin, fmax or fabs: each of their branches is differentiated.",
             operation=name,
         )
-
-    def _switch(self, a, b):
-        """Note that the sign of a difference of nodes decides a branch."""
-        ends = (self.nodes[i].data for i in (a, b) if i is not None and self.nodes[i].kind == "const")
-        if not any(abs(end) == LAST_EXPONENT for end in ends):
-            self.switches.append((a, b))
 
     def _power(self, base, exponent):
         node = self.nodes[exponent]

@@ -23,7 +23,6 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.jets.branches import cse
 from servoctl.methods.accuracy import component_sizes, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
@@ -629,7 +628,7 @@ def _equations(model):
     """One compiled function: X', ∂X'/∂X, the invariants and their Jacobian, both by columns."""
     rates, slopes, invariants = (model.function(name).expression for name in ("ode", "ode_jacobian", "invariants"))
     parts = rates, slopes, invariants
-    f = combined("bounded", lambda x, _, y, *others: cse(ca.vertcat(y[: x.numel()], *others)), *parts)
+    f = combined("bounded", lambda x, _, y, *others: ca.cse(ca.vertcat(y[: x.numel()], *others)), *parts)
     return compiled(f, "bounded", ("rk",))  # which is called at many points, and therefore compiled
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.checks import distinct
 from servoctl.codegen.paths import combined
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import cse, size_of_terms
+from servoctl.jets.branches import size_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate
@@ -54,7 +54,7 @@ class Invariants:
         `rates` are pairs (reference, parameter) of derivatives that it takes behind the references.
         """
         p = self.parameters if extra is None else ca.vertcat(self.parameters, extra)
-        y = ca.densify(cse(ca.vertcat(*outputs)))
+        y = ca.densify(ca.cse(ca.vertcat(*outputs)))
         return function_of(self.q, (*self.references, *rates), name, x, p, y, jets=jets)
 
     def called(self, f, x, p):
@@ -228,7 +228,7 @@ class Equations(Invariants):
         f = self.ode(poles)
 
         def slopes(x, _, y):
-            return cse(ca.vec(ca.densify(ca.jacobian(y[: x.numel()], x))))
+            return ca.cse(ca.vec(ca.densify(ca.jacobian(y[: x.numel()], x))))
 
         return combined(f"{f.name()}_jacobian", slopes, f)
 

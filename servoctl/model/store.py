@@ -23,15 +23,12 @@ import numpy as np
 
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import as_text
-from servoctl.jets.lookup import TABLE_NAME
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.packing import packed, unpacked
 from servoctl.spec.parameters import Parameters
 from servoctl.spec.program import Program
 
-MOST_STORED = 100_000  # numbers in tables of a specification: with more, deriving again is faster than reading
 SETTLED = 1.0  # s: sources that are newer than this before they were loaded may have been loaded in another version
 
 _LOADED = time.time()
@@ -114,7 +111,7 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
     """Hash of all that a derivation depends on: operations in their order, names, numbers and choices.
 
     The arguments are those of `servoctl.reduction.reduce.reduce`. None if the specification cannot be hashed, since
-    instances of subclasses may hold more than their expressions, or if its tables are too large to be stored.
+    instances of subclasses may hold more than their expressions.
     """
     if (type(mechanism), type(program)) != (Mechanism, Program):
         return None
@@ -140,11 +137,10 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
         residuals = [*program.residuals.values(), *program.with_turns.values()]
         expressions = [*residuals, *(e for e in chosen if isinstance(e, ca.SX))]
         function = mechanism.q.as_function(expressions, mechanism.parameters.symbols)
-        text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), as_text(function)])
+        text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), function.serialize()])
     except Exception:  # CasADi raises bare ones; the derivation says what is wrong
         return None
-    stored = sum(map(int, {*TABLE_NAME.findall(text)})) <= MOST_STORED
-    return hashlib.sha256(text.encode()).hexdigest() if stored else None
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import Branches, cse, has_switches
+from servoctl.jets.branches import Branches, has_switches
 from servoctl.model.equations import residual_names
 from servoctl.model.model import Model, derived
 from servoctl.spec.mechanism import Mechanism
@@ -49,7 +49,7 @@ class Switching:
         state = ca.vertcat(*q, *(s for k in range(1, self.model.reduction.top) for s in q.gamma(k)))
         functions = ca.vertcat(*(s.function for s in self.switches))
         others = ca.vertcat(*(s.other for s in self.switches))
-        y = ca.densify(cse(ca.vertcat(functions, others, ca.vec(ca.densify(ca.jacobian(functions, state))))))
+        y = ca.densify(ca.cse(ca.vertcat(functions, others, ca.vec(ca.densify(ca.jacobian(functions, state))))))
         p, names = ca.vertcat(*m.parameters.symbols), self.model.reduction.references
         return compiled(function_of(q, names, "switches", state, p, y), "switches")
 

@@ -10,7 +10,6 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.codegen.interpreted import Interpreter
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import cse
 from servoctl.model.equations import Invariants
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
@@ -61,9 +60,9 @@ class PlantEquations:
 
     def function(self, name, outputs, x=None, p=None):
         """An SX function of (t, x, p) with one dense column."""
-        x, p, y = self.state if x is None else x, self.p if p is None else p, ca.densify(cse(ca.vertcat(*outputs)))
+        x, p, y = self.state if x is None else x, self.p if p is None else p, ca.densify(ca.cse(ca.vertcat(*outputs)))
         f = function_of(self.q, self.references, name, x, p, y)
-        return ca.Function(name, f.sx_in(), [ca.densify(cse(folded(f)))], f.name_in(), ["y"])
+        return ca.Function(name, f.sx_in(), [ca.densify(ca.cse(folded(f)))], f.name_in(), ["y"])
 
     @cached_property
     def _material(self):
@@ -134,8 +133,8 @@ class PlantEquations:
         points, jets = self._material[1], Jets(self.q, [matrix])
         state = ca.vertcat(*self.q, self.velocity, jets.symbols)
         p, y = ca.vertcat(*self.mechanism.parameters.symbols), ca.densify(ca.vec(matrix))
-        f = ca.Function("at_points", [self.q.t, state, p], [ca.densify(cse(y))])
-        f = Interpreter(ca.Function("at_points", f.sx_in(), [ca.densify(cse(folded(f)))]))
+        f = ca.Function("at_points", [self.q.t, state, p], [ca.densify(ca.cse(y))])
+        f = Interpreter(ca.Function("at_points", f.sx_in(), [ca.densify(ca.cse(folded(f)))]))
         t, x = np.asarray(points.t, dtype=float), np.vstack([points.jet(0), points.jet(1)]).astype(float)
         x = np.vstack([x, jets.of(points.instants)])
 
@@ -210,7 +209,7 @@ class PlantEquations:
         driven = self.mechanism.E @ self.force + self.d + self.forces + self.resisting
         force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
         solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
-        return cse(solution), pivots
+        return ca.cse(solution), pivots
 
     @cached_property
     def state_rates(self):

@@ -10,7 +10,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import InconsistentStart, NotRealisable, SingularProgram, SpecificationError
-from servoctl.jets.branches import cse
 from servoctl.reduction.manifold import SPREAD, anywhere, sample
 from servoctl.reduction.ranks import clean, decide, decide_each, eliminate, generic
 from servoctl.reduction.rows import (
@@ -128,7 +127,7 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     derivation = in_words(rows[b], [rows[a] for a in others], top)
     uses = combined_uses([rows[a] for a in support])
     vanishing = sum((rows[a].vanishing for a in support), ())
-    expression = cse(sum(parts))
+    expression = ca.cse(sum(parts))
     chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), vanishing=vanishing)
     row, points = settle(q, chi, rows[:b] + rows[b + 1 :], context, starts)
     if row is None:

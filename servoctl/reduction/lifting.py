@@ -7,7 +7,6 @@ each with the row that defines it, the system has about n entries, and eliminati
 
 import casadi as ca
 
-from servoctl.jets.branches import cse
 from servoctl.jets.series import Series
 from servoctl.jets.tape import Tape, add, divide, holds, multiply
 
@@ -21,7 +20,7 @@ def lifted(expressions, unknowns):
     R x + (S - 1) z = 0, which define the k shared sums z; S is strictly lower triangular. None where other operations
     are made of unknowns than sums and products with factors.
     """
-    expressions = cse(expressions)
+    expressions = ca.cse(expressions)
     tape = Tape(ca.symvar(expressions), expressions.elements())
     place = {s.element_hash(): k for k, s in enumerate(unknowns.elements())}
     free = [place.get(s.element_hash()) for s in tape.symbols]

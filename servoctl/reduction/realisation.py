@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import NotRealisable, SingularProgram, SpecificationError
-from servoctl.jets.branches import cse
 from servoctl.reduction.appell import Realisation, plant_solution
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each
@@ -158,7 +157,7 @@ def _determined_rows(mechanism, rows, material, points, k):
             rank=rank,
             determined=k,
         )
-    return cse(P[chosen, :]), L[chosen, :]
+    return ca.cse(P[chosen, :]), L[chosen, :]
 
 
 def _responses(mechanism, material, points):

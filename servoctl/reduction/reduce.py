@@ -9,7 +9,6 @@ import numpy as np
 
 from servoctl.checks import by_name, distinct, finite, mapping, named, require_kind
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
-from servoctl.jets.branches import cse
 from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
@@ -169,8 +168,8 @@ class Reduction(Packed):
         k = len(self.program.residuals)
         multipliers = self.multipliers[:k] if k else ca.SX(0, 1)
         if self.program.by == "actuators":
-            return cse(desired_actuation(self.mechanism, self.program) + self.realisation.actuation @ multipliers)
-        return cse(self.realisation.B[:, :k] @ multipliers)
+            return ca.cse(desired_actuation(self.mechanism, self.program) + self.realisation.actuation @ multipliers)
+        return ca.cse(self.realisation.B[:, :k] @ multipliers)
 
 
 def needs(rows):

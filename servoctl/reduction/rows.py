@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import SingularProgram, SpecificationError
-from servoctl.jets.branches import cse, shown
+from servoctl.jets.branches import shown
 from servoctl.jets.identity import identical_zeros
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
@@ -380,7 +380,7 @@ def _eliminated(q, row, j, values, lower, points):
     solution, _ = eliminate(matrix, -rest, numbers[:, columns])
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
     expression, *parts = _substituted(row, ca.vertsplit(jets), solution)
-    return replace(row, expression=cse(expression), uses=uses, parts=tuple(parts))
+    return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))
 
 
 def dependence(numbers, first=0):

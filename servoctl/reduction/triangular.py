@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 
 from servoctl.errors import ServoError
-from servoctl.jets.branches import cse
 from servoctl.jets.identity import spread, vanish
 from servoctl.reduction.cascade import Block, Cascade
 from servoctl.reduction.hidden import Deep, complete, in_words
@@ -99,7 +98,7 @@ def _in_own_jets(q, row, motion, place):
     """A row as a function of t, q, ..., γ^(order)."""
     gradient = row.gradient(q)
     slopes = ca.SX(gradient.sparsity(), ca.vertcat(ca.SX(0, 1), *motion.values(gradient.nonzeros())))
-    return replace(row, expression=cse(motion.levels[place]), slopes=ca.densify(slopes), parts=())
+    return replace(row, expression=ca.cse(motion.levels[place]), slopes=ca.densify(slopes), parts=())
 
 
 def _with_uses(q, rows, cascade, points):

@@ -9,7 +9,7 @@ import numpy as np
 
 from servoctl.checks import by_name, column, distinct, interval, mapping, named, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
-from servoctl.jets.branches import Branches, as_text, cse
+from servoctl.jets.branches import Branches
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.overflow import settled
 from servoctl.jets.tape import Tape, evaluate
@@ -177,7 +177,7 @@ class Mechanism(Shown):
             *self.outputs.values(),
             *self.shapes.values(),
         ]
-        function = as_text(q.as_function([*expressions, *self.reported.values()], p.symbols))
+        function = q.as_function([*expressions, *self.reported.values()], p.symbols).serialize()
         facts = [names, list(self.outputs), list(self.shapes), self.inputs, list(self.reported)]
         facts += [p.defaults, self.left_out, self.units, self.limits]
         return json.dumps(facts) + "\n" + function
@@ -321,7 +321,7 @@ class Mechanism(Shown):
         else:
             inertial = lagrange(self.q, self._kinetic)
         inertial = inertial + self._added
-        return cse(inertial - self._applied + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
+        return ca.cse(inertial - self._applied + self.q.V.T @ ca.gradient(self.potential, ca.vertcat(*self.q)))
 
     @cached_property
     def mass(self):
@@ -443,7 +443,7 @@ class Mechanism(Shown):
         """What a given balance is at rest, such as gravity, (n,) SX; the rest is inertia and has a kinetic energy."""
         motion = ca.vertcat(*self.q.gamma(1), *self.q.gamma(2))
         static = ca.substitute(self._inverse_dynamics, motion, ca.SX.zeros(motion.numel()))
-        return ca.SX.zeros(self.q.n) if vanish(spread(static.elements())).all() else cse(static)
+        return ca.SX.zeros(self.q.n) if vanish(spread(static.elements())).all() else ca.cse(static)
 
     def _refuse_nonholonomic_frame(self):
         """Refuse a kinetic energy in quasi-velocities if brackets of the columns of V lie outside their span."""

@@ -5,7 +5,7 @@ import numpy as np
 
 from servoctl.checks import column, finite, mapping, named, positive, require_kind, within, without_effect
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import as_text, without_turns
+from servoctl.jets.branches import without_turns
 from servoctl.jets.overflow import settled
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.packing import Packed
@@ -86,7 +86,7 @@ class Program(Packed):
         parts = (self.with_turns, self.weights, self.toward)
         expressions = [ca.SX(value) for part in parts for value in part.values()]
         symbols = ca.symvar(ca.vertcat(*expressions))
-        text = as_text(ca.Function("program", symbols, expressions))
+        text = ca.Function("program", symbols, expressions).serialize()
         return [[*part] for part in parts], self.by, self.metric, self.jumps, [s.name() for s in symbols], text
 
     @property

@@ -5,19 +5,12 @@ A path is a piecewise polynomial of time::
     path = sv.paths.rest_to_rest(start=(0.0, 4.0), end=(5.0, 2.0), duration=6.0, smoothness=4)
     path(3.0), path.jets(3.0, order=4), path[0] + 1.0, path.then(back), path.at_rate(0.5)
 
-`rest_to_rest`, `trapezoid` and `spline` take parameters of a mechanism in place of numbers: a `ParametricPath`.
-
-The same names with a time first, `rest_to_rest(q.t, ...)`, `trapezoid(q.t, ...)` and `spline(q.t, ...)`, make
-expressions for the residuals of a program, as `line`, `circle` and `piecewise` do. There geometry and timing are
-separate: the first argument is `q.t` or another expression, the time law. A path along a time law has the lower of both
-classes.
+`rest_to_rest`, `trapezoid` and `spline` take parameters of a mechanism in place of numbers: a `ParametricPath`. Curves
+along a path are in `sv.curves`.
 """
 
-from servoctl.spec.curves import circle, line
-from servoctl.spec.paths.expressions import piecewise
 from servoctl.spec.paths.fit import fit, function
-from servoctl.spec.paths.makers import polynomials, rest_to_rest, s_curve, trapezoid
-from servoctl.spec.paths.makers import spline_through as spline
+from servoctl.spec.paths.makers import polynomials, rest_to_rest, s_curve, spline, trapezoid
 from servoctl.spec.paths.parametric import ParametricPath
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import Path
@@ -26,11 +19,8 @@ __all__ = [
     "ParametricPath",
     "Path",
     "as_path",
-    "circle",
     "fit",
     "function",
-    "line",
-    "piecewise",
     "polynomials",
     "rest_to_rest",
     "s_curve",

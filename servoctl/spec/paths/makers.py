@@ -1,22 +1,54 @@
 """Paths from ends, points and limits."""
 
 import functools
+import inspect
 import itertools
 import math
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import array_of, as_numbers, column, finite, named, positive, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths import expressions
 from servoctl.spec.paths.parametric import parametric, varies
 from servoctl.spec.paths.scipy_paths import as_path, by_derivatives
-from servoctl.spec.paths.transition import or_expression
-from servoctl.spec.paths.value import HALVINGS, SAME, Path, cut, require_ascending, vector
+from servoctl.spec.paths.value import HALVINGS, SAME, SMOOTHEST, Path, cut, require_ascending, vector
+
+MISSED = 1e-9  # largest distance of a spline from its points, relative to the largest point
 
 
-@or_expression(expressions.rest_to_rest)
+def _shown(value):
+    return str(value) if isinstance(value, ca.SX) else repr(value)
+
+
+def without_time(maker: Any) -> Any:
+    """The maker of a path, which refuses a time in front of its arguments and shows what to write."""
+    parameters = [p.replace(kind=p.POSITIONAL_OR_KEYWORD) for p in inspect.signature(maker).parameters.values()]
+    timed = inspect.Signature([inspect.Parameter("t", inspect.Parameter.POSITIONAL_OR_KEYWORD), *parameters])
+
+    @functools.wraps(maker)
+    def made(*args, **kwargs):
+        try:
+            given = timed.bind(*args, **kwargs).arguments
+        except TypeError:
+            return maker(*args, **kwargs)
+        time, *others = given.items()
+        shown = [(name, text if len(text := _shown(value)) < 40 else name) for name, value in others]
+        plain = {p.name for p in parameters if p.default is p.empty and p.name not in kwargs}
+        line = f"sv.paths.{maker.__name__}({', '.join(x if name in plain else f'{name}={x}' for name, x in shown)})"
+        raise SpecificationError(
+            f"{maker.__name__} was called with the time {time[1]} before its other arguments.",
+            "It makes a path: data with numbers, which a reference follows in time.",
+            nearest=f"{line}.",
+            do=f"Write r = q.references(X={line}), and r.X in the program.",
+            name=maker.__name__,
+        )
+
+    return made
+
+
+@without_time
 def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
     """Move from rest to rest along the polynomial of degree 2k + 1 whose first k derivatives vanish at both ends.
 
@@ -56,7 +88,7 @@ def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
     return _along(breaks, step, start, end, k)
 
 
-@or_expression(expressions.trapezoid)
+@without_time
 def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
     """Cover a distance at a constant speed that is reached, and left, along smooth ramps.
 
@@ -169,8 +201,8 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     return _along(finite("t_start", t_start) + unit.breaks, table, start, end, 2, np.isfinite(unit.classes))
 
 
-@or_expression(expressions.spline)
-def spline_through(times, points, *, smoothness=2, ends="rest"):
+@without_time
+def spline(times, points, *, smoothness=2, ends="rest"):
     """Pass through points at given times along SciPy's interpolating spline.
 
     With `ends="rest"` the spline has degree 2k + 1, k = `smoothness`, and its first k derivatives vanish at both
@@ -209,7 +241,7 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
             dim = len(column(points[0], "point 0"))
             rows = (ca.horzcat(*column(point, f"point {i}", dim)) for i, point in enumerate(points))
             points = ca.vertcat(*rows)
-        unit = spline_through(times, np.eye(points.shape[0]), smoothness=smoothness, ends=ends)
+        unit = spline(times, np.eye(points.shape[0]), smoothness=smoothness, ends=ends)
         return parametric(unit, points.T, ca.SX.zeros(points.shape[1]))
     rest, k = named(ends, ("rest", "natural"), "spline end") == "rest", _class(smoothness)
     times, points = samples(times, points)
@@ -230,12 +262,12 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
         miss = np.abs(path.jets(times, 0)[0].T - points).max()
     except (ValueError, np.linalg.LinAlgError):  # SciPy's equations are singular for very uneven intervals
         pass
-    if not miss <= expressions.MISSED * np.abs(points).max():
+    if not miss <= MISSED * np.abs(points).max():
         ratio = np.diff(times).max() / np.diff(times).min()
         raise SpecificationError(
             f"The spline of degree {degree} misses its points by {miss:.1e}; its longest interval is {ratio:.3g} times "
             "its shortest.",
-            f"A spline passes through its points to within {expressions.MISSED:g} of the largest.",
+            f"A spline passes through its points to within {MISSED:g} of the largest.",
             do="Choose intervals in proportion to the distances between the points, or a lower smoothness.",
             degree=degree,
             miss=miss,
@@ -315,7 +347,7 @@ def samples(times, points):
 
 
 def _class(k, least=0):
-    return whole_of("smoothness", k, range(least, expressions.SMOOTHEST + 1))
+    return whole_of("smoothness", k, range(least, SMOOTHEST + 1))
 
 
 def _ends(start, end):

@@ -4,8 +4,7 @@ import numpy as np
 
 from servoctl.checks import whole_of, without_effect
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths.expressions import SMOOTHEST
-from servoctl.spec.paths.value import Path, counted, cut
+from servoctl.spec.paths.value import SMOOTHEST, Path, counted, cut
 
 MOST_COUNTED = 300  # pieces of bare polynomials: among more, rounding of high derivatives looks like their jumps
 

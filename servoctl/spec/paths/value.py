@@ -13,6 +13,7 @@ RULES = ("hold", "continue", "periodic", None)
 SAME = 1e-13  # of the largest instant of a path: breaks that differ by less are one, but for rounding
 COUNTED = 1e-7  # of a derivative's largest value, up to which its jump is rounding: SciPy's monomials of C^9 have 1e-8
 CANCELLING = 16.0  # sum of the terms of a polynomial over its largest value, beyond which it is cut: four binary digits
+SMOOTHEST = 100  # class of a path, beyond which the terms of its polynomials leave the range of a double
 HALVINGS = 8  # of a piece: 256 parts, which a path of class 100 needs at its ends
 
 
