@@ -187,6 +187,8 @@ def other_paths(paths, changes):
 
 def paths_at(paths, parameters, values):
     """The paths by name with the values (n_p,) of parameters that they contain."""
+    if not any(map(parameters_of, paths.values())):
+        return paths
     written = {s.name(): float(value) for s, value in zip(parameters.symbols, values, strict=False)}
     for name, path in paths.items():
         if unknown_ones := [one for one in parameters_of(path) if one not in written]:

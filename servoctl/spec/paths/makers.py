@@ -22,7 +22,7 @@ def rest_to_rest(start, end, duration, *, smoothness=4, t_start=0.0):
 
     Of class C^k, k = `smoothness`; it minimises the integral of the square of derivative k + 1. With sigma = (t -
     t_start)/duration it is start + (end - start) I_sigma(k + 1, k + 1), the regularised incomplete beta function.
-    Held before and after.
+    Held before and after. Expressions of parameters in place of numbers make a `ParametricPath`.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def trapezoid(distance, duration, ramp, *, smoothness=4, t_start=0.0):
 
     Of class C^k, k = `smoothness`: during the first and last `ramp` seconds the speed rises and falls along the
     polynomial of `rest_to_rest` of class k - 1. The cruising speed is distance/(duration - ramp). Starts at 0; held
-    before and after.
+    before and after. Expressions of parameters in place of numbers make a `ParametricPath`.
 
     Parameters
     ----------
@@ -168,6 +168,8 @@ def spline_through(times, points, *, smoothness=2, ends="rest"):
 
     Derivatives amplify noise: an error e of points at a distance h becomes one of about e (pi/h)^k in derivative k.
     Use `fit` for measurements. A high smoothness over very uneven times overshoots between the points.
+
+    Expressions of parameters in place of numbers make a `ParametricPath`.
 
     Parameters
     ----------

@@ -10,6 +10,7 @@ is a polynomial of the same degree on the same piece: a further row of the table
 import functools
 import inspect
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -30,7 +31,7 @@ def varies(value):
     return any(map(varies, value)) if isinstance(value, (list, tuple)) else isinstance(value, ca.SX)
 
 
-def or_parameters(*numbers, times=None):
+def or_parameters(*numbers, times=None) -> Any:
     """The decorator of a maker of paths which makes a `ParametricPath` where some of its numbers are expressions.
 
     `numbers` are the names of its arguments that may be, the first one that of a point, or of points at `times`; in
@@ -38,11 +39,14 @@ def or_parameters(*numbers, times=None):
     """
 
     def decorator(make):
-        MAKERS[make.__name__] = make
+        MAKERS[make.__name__], signature = make, inspect.signature(make)
 
         @functools.wraps(make)
         def either(*args, **kwargs):
-            given = inspect.signature(make).bind(*args, **kwargs)
+            try:
+                given = signature.bind(*args, **kwargs)
+            except TypeError:
+                return make(*args, **kwargs)  # which says what is wrong
             varied = [name for name, value in given.arguments.items() if varies(value)]
             if others := set(varied) - {*numbers}:
                 _refuse_expressions(make.__name__, sorted(others), numbers)
