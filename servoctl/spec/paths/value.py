@@ -276,7 +276,7 @@ class Path(Value):
         Parameters
         ----------
         factor : float
-            Positive; 2 halves the time that it takes.
+            Positive; 2 halves the time that it takes. An expression of parameters makes a `ParametricPath`.
         about : float, optional
             The instant at which both clocks agree [s]; default: the first one of the path.
 
