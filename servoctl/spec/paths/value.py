@@ -142,6 +142,9 @@ class Path(Value):
         low, high = self.breaks[pieces], self.breaks[pieces + 1]
         result = taylor(self.coefficients, pieces, ((t - low) + (t - high)) / (high - low), order)
         result[1:, held] = 0.0
+        for end, rule, class_ in ((first, self.before, self.classes[0]), (last, self.after, self.classes[-1])):
+            if rule in ("hold", None):  # what is zero by its class is not rounding: a rank may hang on it
+                result[1 : int(min(class_, order)) + 1, t == end] = 0.0
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
     def _require_known(self, t, order):
