@@ -667,3 +667,10 @@ def test_a_time_before_the_other_arguments_is_refused_with_the_line_to_write(nam
         make()
     with pytest.raises(TypeError, match="smothness"):
         rest_to_rest(0.0, 5.0, 6.0, smothness=4)
+
+
+def test_what_moved_elsewhere_is_named():
+    for name, where in (("line", "sv.curves.line"), ("circle", "sv.curves.circle"), ("piecewise", "sv.paths.polynomials")):
+        with pytest.raises(AttributeError, match=where):
+            getattr(sv.paths, name)
+    assert not hasattr(sv.paths, "unknown")

@@ -15,6 +15,8 @@ from servoctl.spec.paths.parametric import ParametricPath
 from servoctl.spec.paths.scipy_paths import as_path
 from servoctl.spec.paths.value import Path
 
+_ELSEWHERE = {"circle": "sv.curves.circle", "line": "sv.curves.line", "piecewise": "sv.paths.polynomials"}
+
 __all__ = [
     "ParametricPath",
     "Path",
@@ -27,3 +29,8 @@ __all__ = [
     "spline",
     "trapezoid",
 ]
+
+
+def __getattr__(name):
+    where = f" It is {_ELSEWHERE[name]} now." if name in _ELSEWHERE else ""
+    raise AttributeError(f"sv.paths has no {name!r}.{where}")
