@@ -33,8 +33,8 @@ def arm():
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=C * q2**2 / 2, forces={"q2": -D * dq2}, actuators={"torque": q1}
     )
-    path = sv.paths.rest_to_rest(q.t, 0.0, pi / 2, duration=2.0, smoothness=4)
-    model = sv.derive(mechanism, sv.Program({"angle": q1 + GAMMA * q2 - path}))
+    r = q.references(angle=sv.paths.rest_to_rest(0.0, pi / 2, duration=2.0, smoothness=4))
+    model = sv.derive(mechanism, sv.Program({"angle": q1 + GAMMA * q2 - r.angle}))
     return model, 2.0, "q2", {0.5: -0.308555247, 1.5: 0.312284407}
 
 
@@ -42,8 +42,9 @@ def aircraft():
     """As `arm`: the centre of mass of the gallery's aircraft, from (0, 0) to (10, 5) m."""
     mechanism, _ = gallery["vtol-centre"].build()
     x, z, _ = mechanism.q
-    path = sv.paths.rest_to_rest(mechanism.q.t, (0.0, 0.0), (10.0, 5.0), duration=3.0, smoothness=4)
-    model = sv.derive(mechanism, sv.Program({"X": x - path[0], "Z": z - path[1]}))
+    path = sv.paths.rest_to_rest((0.0, 0.0), (10.0, 5.0), duration=3.0, smoothness=4)
+    X, Z = mechanism.q.references(across=path[0], up=path[1])
+    model = sv.derive(mechanism, sv.Program({"X": x - X, "Z": z - Z}))
     return model, 3.0, "theta", {0.75: -0.563010398, 2.25: 1.033108370}
 
 
@@ -60,13 +61,13 @@ def instants(duration):
 
 def by_arrays(model):
     """X' and the invariants with their Jacobian at instants (N,) and states (n_x, N)."""
-    ode, invariants, p = model.function("ode"), model.function("invariants"), model.parameters
+    ode, invariants, p = model.function("ode"), model.function("invariants"), model.p
     return lambda t, x: (ode.grid(t, x, p), invariants.grid(t, x, p))
 
 
 def by_instants(model):
     """As `by_arrays`, by one call for each instant."""
-    ode, invariants, p = model.function("ode"), model.function("invariants"), model.parameters
+    ode, invariants, p = model.function("ode"), model.function("invariants"), model.p
 
     def values(t, x):
         return [np.array([f(s, each, p) for s, each in zip(t, x.T, strict=True)]).T for f in (ode, invariants)]

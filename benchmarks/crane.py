@@ -119,8 +119,9 @@ def scene():
     mechanism = sv.Mechanism(
         q, gibbs=S, potential=-p.m_load * p.g * load[1], actuators={"trolley": x, "winch": beta}, parameters=p
     )
-    path = sv.paths.rest_to_rest(q.t, start=tuple(FIRST), end=tuple(LAST), duration=T, smoothness=4)
-    program = sv.Program({"X": load[0] - path[0], "Z": load[1] - path[1]}, by="actuators")
+    path = sv.paths.rest_to_rest(start=FIRST, end=LAST, duration=T, smoothness=4)
+    r = q.references(X=path[0], Z=path[1])
+    program = sv.Program({"X": load[0] - r.X, "Z": load[1] - r.Z}, by="actuators")
     model = sv.derive(mechanism, program)
     return model, model.start(guess={"beta": FIRST[1] / R})
 
@@ -129,7 +130,7 @@ def along_the_path():
     model, start = scene()
     path, (_, actuation) = model.function("path"), model.signals("actuation")
     path.native("newton"), actuation.native("grid")  # compiled now
-    q0, p = start.values[:3], model.parameters
+    q0, p = start.values[:3], model.p
 
     def call():
         nodes, _ = path.continuation(TIMES[[0, -1]], q0, p, T / 50, 1000)

@@ -22,7 +22,8 @@ def plan():
     load = ca.vertcat(x + L * ca.sin(theta), -L * ca.cos(theta))
     S = sv.particle(q, CART, x) + sv.particle(q, LOAD, load)
     plant = sv.plant(sv.Mechanism(q, gibbs=S, potential=LOAD * G * load[1], actuators={"cart": x}))
-    program = sv.Program({"X": load[0] - sv.paths.rest_to_rest(q.t, 0.0, WAY, T)})
+    r = q.references(X=sv.paths.rest_to_rest(0.0, WAY, T))
+    program = sv.Program({"X": load[0] - r.X})
     return lambda: float(np.abs(sv.relaxed(plant, program, (0.0, T), weight=BETA).residual["X"]).max())
 
 

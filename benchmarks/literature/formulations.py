@@ -201,7 +201,7 @@ def _measured(n, k, model, formulations, timed):
             counts = (f.operations, formulation(model, how, forces=True).operations)
 
         def evaluate(f=f, dense=how == "assembly"):
-            y = f.grid(t, x, model.parameters)
+            y = f.grid(t, x, model.p)
             return _solved(y, model.n) if dense else y
 
         accelerations = evaluate()

@@ -264,7 +264,7 @@ def _reference(model, start, t):
 def _integrated(model, form, method, t, reference, first):
     f = servo_dae(model, form)
     rates = np.zeros(model.nq + model.n)
-    if not np.all(np.isfinite(f(t[0], reference[:, 0], np.concatenate([model.parameters, [1.0], rates])))):
+    if not np.all(np.isfinite(f(t[0], reference[:, 0], np.concatenate([model.p, [1.0], rates])))):
         f = servo_dae(derived_near(model, t[0], first), form)  # pivots of the projection vanish at the start
     began = perf_counter()
     z, iterations = _march(f, model, METHODS[method], t, reference[:, 0])
@@ -302,7 +302,7 @@ def _march(f, model, order, t, z0):
         else:
             weights = (1.5, -2.0, 0.5)
         history = sum(w * x[:moving] for w, x in zip(weights[1:], reversed(past), strict=False)) / h
-        p = np.concatenate([model.parameters, [weights[0] / h], history])
+        p = np.concatenate([model.p, [weights[0] / h], history])
         state, iterations = _newton(f, t[k], z[-1], p, model.nq)
         total += iterations
         if state is None:
