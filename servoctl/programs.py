@@ -30,7 +30,7 @@ def follow_point(name, position, target):
     position : SX scalar, column or sequence, one to three entries
         The point [m], a function of the coordinates.
     target : float, SX or sequence of as many
-        Where it is [m]: an expression of references, as those of `servoctl.curves`, of time or of other points.
+        Where it is [m]: an expression of time, as those of `servoctl.paths`, or of other points.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def follow_path(name, position, path, along):
     position : SX column or sequence
         The point [m].
     path : callable
-        The path [m] as a function of its parameter: `lambda s: sv.curves.circle(s, (0, 1), 0.5)`.
+        The path [m] as a function of its parameter: `lambda s: sv.paths.circle(s, (0, 1), 0.5)`.
     along : SX
         The parameter: a time law, or the symbol of a coordinate that only says how far the point is; the point is then
         free along the path.
@@ -70,7 +70,7 @@ def follow_path(name, position, path, along):
         raise SpecificationError(
             f"The path of {name!r} is a {type(path).__name__}.",
             "It is a function of the path's parameter.",
-            do="Write lambda s: sv.curves.line(s, start, end); for an expression of time, use follow_point.",
+            do="Write lambda s: sv.paths.line(s, start, end); for an expression of time, use follow_point.",
             name=name,
         )
     return follow_point(name, position, path(_scalar(along, f"the parameter of {name!r}")))
@@ -87,7 +87,7 @@ def pose(name, frame, position, rotation):
     position : (3,) SX or sequence
         Its desired origin [m].
     rotation : (3, 3) SX or array
-        Its desired rotation from its axes to the world's, as from `rotations.turn` or `rotations.slerp`.
+        Its desired rotation from its axes to the world's, as from `paths.turn` or `paths.slerp`.
 
     Returns
     -------
