@@ -37,16 +37,7 @@ class Followed:
         _alive[self.address] = self
 
     def jets(self, t, order, instant=None):
-        """Derivatives 0 .. `order` at times (N,), of the pieces that instants (N,) select: ((order + 1) n, N).
-
-        They are NaN where a time is none: steps that fail ask for such, and are told by what they get.
-        """
-        known = np.isfinite(t)
-        if not known.all():
-            jets = np.full(((order + 1) * len(self.paths), len(t)), np.nan)
-            if known.any():
-                jets[:, known] = self.jets(t[known], order, None if instant is None else instant[known])
-            return jets
+        """Derivatives 0 .. `order` at times (N,), of the pieces that instants (N,) select: ((order + 1) n, N)."""
         key = (order, *np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
         last, jets = self._last
         if key is None or key != last:  # iterations ask for one instant again and again
