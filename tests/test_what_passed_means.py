@@ -274,7 +274,8 @@ def scene():
     rider = ca.vertcat(x + 0.9 * ca.sin(pitch), 0.9 * ca.cos(pitch))
     S = sv.particle(q, 10.0, x) + sv.particle(q, 70.0, rider)
     mechanism = sv.Mechanism(q, S, potential=70.0 * 9.81 * rider[1], actuators={"wheel": x})
-    return mechanism, sv.Program({"speed": q.d(1)[0] - sv.paths.rest_to_rest(q.t, 0.0, 1.0, 2.0)})
+    r = q.references(speed=sv.paths.rest_to_rest(0.0, 1.0, 2.0))
+    return mechanism, sv.Program({"speed": q.d(1)[0] - r.speed})
 '''
 
 
