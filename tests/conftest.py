@@ -155,6 +155,13 @@ def numbers(expressions, values):
     return np.array(ca.Function("f", symbols, [expressions]).call([values[s.name()] for s in symbols])[0]).ravel()
 
 
+def along(q, expression, t):
+    """An expression with the numbers of its references, and their derivatives up to the second, at an instant [s]."""
+    jets = [(q.family.jet(name, k), path.jets(t, 2)[k, 0]) for name, path in q.family.paths.items() for k in range(3)]
+    symbols, values = zip(*jets, strict=True) if jets else ((), ())
+    return ca.substitute(expression, ca.vertcat(*symbols), ca.DM(values)) if jets else expression
+
+
 def at_random(q, parameters=None, seed=0, low=0.3, high=1.2, level=4):
     """Numbers by name for t, the jets up to a level and the parameters."""
     names = ["t", *(name for k in range(level + 1) for name in q.jet_names(k))]

@@ -42,8 +42,8 @@ def test_the_accelerations_are_those_of_the_model():
     x = np.random.default_rng(1).uniform(0.2, 1.2, len(model.state_names))
     rates = model.function("ode")(0.0, x, model.p)[model.nq : model.nq + model.n]
     for how in ("eliminated", "sparse", "qr"):
-        assert formulation(model, how)(0.0, x, model.parameters) == pytest.approx(rates, rel=1e-9)
-        forces = formulation(model, how, forces=True)(0.0, x, model.parameters)
+        assert formulation(model, how)(0.0, x, model.p) == pytest.approx(rates, rel=1e-9)
+        forces = formulation(model, how, forces=True)(0.0, x, model.p)
         jets = np.concatenate([x, rates])
         mu = model.signals("all_multipliers")[1](0.0, jets, model.p)
         assert forces == pytest.approx(np.concatenate([rates, mu]), rel=1e-8)

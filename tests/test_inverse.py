@@ -171,7 +171,8 @@ def test_a_rough_path_gets_a_relaxed_plan():
     path = sv.paths.rest_to_rest((0.0, 4.0), (5.0, 2.0), duration=6.0, smoothness=2)
     r = mechanism.q.references(across=path[0], below=path[1])
     program = sv.Program({"X": x + l * ca.sin(theta) - r.across, "Z": l * ca.cos(theta) - r.below})
-    run = sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0})
+    assert sv.inverse(mechanism, program, (0.0, 6.0), start={"l": 4.0}).method == "algebraic"  # its end is not passed
+    run = sv.inverse(mechanism, program, (0.0, 7.0), start={"l": 4.0})
     assert run.method == "relaxed" and "C^2" in said(run) and "needs 4" in said(run)
     assert np.abs(run.residual["X"][0]).max() < 1e-2
 

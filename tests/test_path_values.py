@@ -275,6 +275,14 @@ def test_a_path_of_which_nothing_was_said_outside_is_held_as_far_as_its_derivati
 # joins and sums ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("k", [0, 2, 4, 10])
+def test_derivatives_that_vanish_by_the_class_of_a_held_end_are_no_rounding(k):
+    path = rest_to_rest((0.0, 0.1), (3**0.5, 1.0), 4.0, smoothness=k)
+    jets = path.jets([0.0, 4.0], k + 1)
+    assert not jets[1 : k + 1].any() and jets[k + 1].all()
+    assert np.abs(jets[0] - np.transpose([path(-1.0), path(5.0)])).max() < 1e-15
+
+
 def test_sums_and_multiples_are_those_of_polynomials():
     a = polynomials([0.0, 1.0, 3.0], RNG.normal(size=(4, 2)), before="continue", after="continue")
     b = polynomials([-1.0, 1.0, 1.7, 4.0], RNG.normal(size=(6, 3)), before="continue", after="continue")

@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from conftest import motion, numbers, signal
+from conftest import along, motion, numbers, signal
 from refusals import refused
 
 import servoctl as sv
@@ -52,7 +52,7 @@ def constrained_minimum(mechanism, program, z, t, weights):
     def second(named):
         if not named:
             return np.zeros((0, n)), np.zeros(0)
-        e = ca.vertcat(*(q.dt(e, 2 - max(q.order(e), 0)) for e in named.values()))
+        e = along(q, ca.vertcat(*(q.dt(e, 2 - max(q.order(e), 0)) for e in named.values())), t)
         return matrix(ca.jacobian(e, acceleration)), numbers([e], at_zero)
 
     (G, c), (G_m, c_m) = second(program.residuals), second(mechanism.constraints)

@@ -33,7 +33,7 @@ def test_the_residual_vanishes_on_the_models_motion(name, form, gallery_model):
     model = gallery_model(name)
     z, rates = solution(model, name, 0.7)
     f = servo_dae(model, form)
-    p = np.concatenate([model.parameters, [0.0], rates])
+    p = np.concatenate([model.p, [0.0], rates])
     residual = f(0.7, z, p)[: len(z)]
     assert np.abs(residual).max() < 1e-6 * (1 + np.abs(z).max())
     off = f(0.7, z + np.eye(len(z))[-1] * np.abs(z).max(), p)[: len(z)]
@@ -46,7 +46,7 @@ def test_the_jacobian_is_that_of_the_residual(name, form, gallery_model):
     model = gallery_model(name)
     z, rates = solution(model, name, 0.7)
     f, n = servo_dae(model, form), len(z)
-    p = np.concatenate([model.parameters, [30.0], rates])
+    p = np.concatenate([model.p, [30.0], rates])
     jacobian = f(0.7, z, p)[n:].reshape(n, n).T
     step = 1e-6 * (1 + np.abs(z))
     differences = [(f(0.7, z + d, p) - f(0.7, z - d, p))[:n] / (2 * d.sum()) for d in np.diag(step)]

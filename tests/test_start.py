@@ -452,8 +452,7 @@ def rolled(path, duration=4.0):
     model = bicycle()
     q = model.reduction.mechanism.q
     x, y, *_ = q
-    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=duration, smoothness=6)).s
-    X, Y = path(s)
+    X, Y = path(q.references(along=sv.paths.rest_to_rest(0.0, 1.0, duration=duration, smoothness=6)).along)
     return sv.derive(model.reduction.mechanism, sv.Program({"X": x - X, "Y": y - Y}))
 
 
@@ -615,7 +614,7 @@ def test_a_start_where_the_divisor_of_a_hidden_constraint_is_faint_is_refused(t)
         model.start(t)
     later = caught.value.details["nearest_time"]
     assert caught.value.details["size"] < 1e-6 and (later is None) == (t > 3)
-    for good in (0.1, later or 2.0):  # δ follows from the curvature of y = x²/3
+    for good in (0.12, later or 2.0):  # δ follows from the curvature of y = x²/3
         x, delta = 3 * np.ravel(cf.rest_to_rest([good], 0, 0.0, 1.0, 4.0, 6))[0], model.start(good, x=0.0)["delta"]
         assert delta == pytest.approx(np.arctan(1.1 * 2 / 3 / (1 + 4 * x**2 / 9) ** 1.5), abs=1e-8)
 

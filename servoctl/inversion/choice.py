@@ -33,6 +33,7 @@ from servoctl.inversion.verdict import (
     verdict_with,
 )
 from servoctl.methods.choice import Algebraic, Bounded, Method, as_method
+from servoctl.model.following import breaks_within
 from servoctl.model.model import derive
 from servoctl.model.start import State
 from servoctl.plants.plant import plant
@@ -41,6 +42,7 @@ from servoctl.run import Run
 from servoctl.simulation import as_state, simulate
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
+from servoctl.spec.references import required_paths
 from servoctl.values import frozen
 from servoctl.verification.remarks import path
 
@@ -123,6 +125,8 @@ def inverse(
     by_hand = method if method is None or isinstance(method, str) and method == RELAXED else as_method(method)
     try:
         model = derive(mechanism, program, known)
+        required_paths(model.paths)
+        breaks_within(model, span)
     except SpecificationError as error:
         facts = error.details
         if by_hand not in (None, RELAXED) or not {"needs", "has"} <= facts.keys():

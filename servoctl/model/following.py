@@ -47,8 +47,10 @@ def require_class(name, path, needs, span, jumps):
     held, least = path.held(), needs - (1 if jumps else 0)
     inside = [t for t in held.breaks_below(least, low, high) if low < t < high]
     if inside:
-        class_ = int(held.classes[np.argmin(np.abs(held.breaks - inside[0]))]) if held.before != "periodic" else None
-        has = "" if class_ is None else f", has {f'C^{class_}' if class_ >= 0 else 'a jump'}"
+        first, last = held.breaks[[0, -1]]
+        at = first + (inside[0] - first) % (last - first) if held.before == "periodic" else inside[0]
+        class_ = int(held.classes[np.argmin(np.abs(held.breaks - at))])
+        has = f", has {f'C^{class_}' if class_ >= 0 else 'a jump'}"
         raise SpecificationError(
             f"The path of {name} needs C^{needs}{has} at t = {inside[0]:.6g} s.",
             f"The actuation contains its derivative {needs}, which must be continuous.",

@@ -186,9 +186,14 @@ def _determined(model, t, x):
     return np.sum(sizes > SPANNED) >= len(invariant_names(model))
 
 
+def _written(model):
+    """The constraints as they were written."""
+    return tuple(row for row in model.reduction.original.values() if row.order <= model.reduction.top)
+
+
 def _at_rest(model, t, chosen):
     """The constraints as they were written, and the state nearest the chosen values that satisfies them."""
-    rows = tuple(row for row in model.reduction.original.values() if row.order <= model.reduction.top)
+    rows = _written(model)
     equations = JetEquations(model, t, {}, rows)
     known = {name: v for name, v in chosen.items() if name in equations.names}
     aim = Aim.of(equations.names, known, {}, model.reduction.mechanism.q.identity)
@@ -306,7 +311,7 @@ def _moves(model, t, guess, still):
     q = model.reduction.mechanism.q
     measured = [name not in still.coordinates for name in q.names]
     t, x = state.t, state.values
-    speed = np.abs(_state_rates(model, t, x)[measured]).max(initial=0.0)
+    speed = np.abs(_rates_of(model, t, x, _written(model))[measured]).max(initial=0.0)
     return bool(speed > MOVES * (1.0 + np.abs(x[: q.nq]).max())) and _determined(model, t, x)
 
 

@@ -130,8 +130,8 @@ def _planned(args, motion, report):
     forward = None if method else _simulate(motion, options)
     try:
         if isinstance(method, Bounded):
-            corners = (t0, t1) if args.t_span else (t0, *corners_of(model), t1)
-            span = min(corners), max(corners)
+            instants = t0, t1, *corners_of(model)  # the whole path, and the rest on either side of it
+            span = motion.span if args.t_span else (min(instants), max(instants))
             window = Problem(model, span, start.values).window(method.window) if args.samples else span
             whole = replace(motion, span=span)
             return whole, *_simulate(whole, _options(args, model, window) | {"method": method})

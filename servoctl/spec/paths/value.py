@@ -144,6 +144,9 @@ class Path(Value):
             rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
             result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
         result[1:, held] = 0.0
+        for end, rule, class_ in ((first, self.before, self.classes[0]), (last, self.after, self.classes[-1])):
+            if rule in ("hold", None):  # what is zero by its class is not rounding: a rank may hang on it
+                result[1 : int(min(class_, order)) + 1, t == end] = 0.0
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
     def _require_known(self, t, order):
@@ -273,7 +276,7 @@ class Path(Value):
         Parameters
         ----------
         factor : float
-            Positive; 2 halves the time that it takes.
+            Positive; 2 halves the time that it takes. An expression of parameters makes a `ParametricPath`.
         about : float, optional
             The instant at which both clocks agree [s]; default: the first one of the path.
 
