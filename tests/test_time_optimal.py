@@ -103,6 +103,27 @@ def test_limits_of_rates_give_the_law_of_seven_pieces():
     assert active(law, limits) > 0.99
 
 
+def test_the_part_of_a_path_within_the_span_is_the_curve():
+    """A line at constant speed with breaks before, inside and after the span, and one that goes on."""
+    for breaks in ([0.0, 20.0, 50.0, 80.0], [-50.0, -10.0, 50.0], [0.0, 10.0]):
+        table = np.array([np.full(len(breaks) - 1, 0.06), 0.06 * np.array(breaks[:-1])])
+        path = sv.paths.polynomials(breaks, table, before="continue", after="continue")
+        law = sv.fastest(*mass(lambda q, path=path: q.references(X=path).X), {"push": 4.0}, (0.0, 50.0), shape=True)
+        assert law.plan.t[-1] == pytest.approx(2.0 * np.sqrt(3.0 * 2.0 / 4.0), rel=1.1 / INTERVALS)
+        assert law.plan["x"][-1] == pytest.approx(3.0) and law.program.names == ("X",)
+
+
+def test_geometry_along_a_reference_may_turn_back():
+    """x = sin(π s) from s = 0 to 1: 0, 1 m and back; at the turn the mass need not stop in s."""
+    q = sv.coordinates("x")
+    s = q.references(s=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0)).s
+    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, q[0]), actuators={"push": q[0]})
+    law = sv.fastest(mechanism, sv.Program({"X": q[0] - ca.sin(np.pi * s)}), {"push": 4.0}, (0.0, 2.0), shape=True)
+    least = 2 * np.sqrt(2.0)  # s: half a metre at full thrust of 2 m/s^2, a metre against it, half a metre
+    assert least < law.plan.t[-1] <= least * (1.0 + 1.1 / INTERVALS)
+    assert law.plan["x"].max() == pytest.approx(1.0, abs=1e-3) and sv.verify(law.plan).passed
+
+
 def test_parameters_and_states_take_part():
     """Half the mass at the same thrust; a limit of speed v adds a coast: T = d/v + v m/F."""
     law = sv.fastest(*mass(S7), {"push": 4.0, "dx": 1.0}, (0.0, 5.0), parameters={"m": 4.0}, shape=True)
@@ -157,6 +178,9 @@ def test_what_is_no_curve_is_refused():
             sv.fastest(pushed[0], program, wanted, (0.0, 2.0), shape=True)
     with refused(sv.errors.SpecificationError, "at 0.5", name="X"):
         sv.fastest(*mass(there_and_back), wanted, (0.0, 2.0), shape=True)
+    corner = sv.paths.polynomials([0.0, 1.0, 2.0], [[1.0, 0.5], [0.0, 1.0]])
+    with refused(sv.errors.SpecificationError, "turns at 0.5 of its span", name="X"):
+        sv.fastest(*mass(lambda q: q.references(X=corner).X), wanted, (0.0, 2.0), shape=True)
     windy = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), forces={"x": ca.sin(t)}, actuators={"push": x})
     with refused(sv.errors.SpecificationError, name="the mechanism"):
         sv.fastest(windy, pushed[1], wanted, (0.0, 2.0), shape=True)

@@ -52,7 +52,7 @@ class Followed:
 
 
 def _jets_of(path, t, order, instants):
-    """Derivatives (order + 1, N) of a path; NaN where times (N,) or instants (N,) are not finite, as in expressions."""
+    """Derivatives (order + 1, N) of a path, NaN where times (N,) or instants (N,) are not finite."""
     known = np.isfinite(t) & np.isfinite(instants)
     if known.all():
         return path.jets(t, order, instants)[:, 0]

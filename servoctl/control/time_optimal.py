@@ -38,6 +38,7 @@ SPLINE = (9, 80)  # the degree and the intervals of its spline
 MISSED = (1e-12, 1e-8)  # of its extent: by which the polynomial, and the spline, may miss it
 FITTED = 1e-7  # error of a derivative of references along a law, of its largest value: rounding of class 6 has 2e-8
 PANELS, GAUSS = 2000, np.polynomial.legendre.leggauss(8)  # of the arc length; of a quadrature in each panel
+BESIDE = 1e-9  # of the span: an end of it
 LEAST = 1e-4  # duration, relative to that of the first motion
 
 
@@ -138,7 +139,7 @@ class Curve:
         result = {}
         for name, path in self.pieces.items():
             breaks, inner = path.breaks, (path.breaks[1:-1] > 0) & (path.breaks[1:-1] < 1)
-            first = int(np.argmax(np.append(inner, True)))
+            first = np.count_nonzero(breaks[1:-1] <= 0)
             rows = slice(first, first + inner.sum() + 1)
             of_piece = partial(ca.pw_const, c[0], breaks[1:-1][inner]) if inner.any() else lambda row: ca.SX(row[0])
             middle, half = (breaks[1:] + breaks[:-1]) / 2, np.diff(breaks) / 2
@@ -155,13 +156,17 @@ class Curve:
 
         def jets(t):
             s, series = law.jets(t, k)[:, 0, 0] / factorials, np.zeros((k + 1, len(self.pieces)))
-            outer = np.stack([path.jets(s[0], k)[:, 0, 0] for path in self.pieces.values()], axis=1)
-            s[0] = 0.0
+            at, s[0] = float(np.clip(s[0], 0.0, 1.0)), 0.0
+            outer = np.stack([path.jets(at, k)[:, 0, 0] for path in self.pieces.values()], axis=1)
             for d in (outer / factorials[:, None])[::-1]:
                 series = np.array([s[i::-1] @ series[: i + 1] for i in range(k + 1)])
                 series[0] += d
             return series * factorials[:, None]
 
+        for name, path in self.pieces.items():
+            if len(rough := path.breaks_below(k, BESIDE, 1 - BESIDE)):
+                what = f"turns at {rough[0]:.3g} of its span with fewer than {k} continuous derivatives"
+                raise self._refused(f"The path of {name}", what, name)
         if all(path.coefficients.shape[::2] == (1, 2) for path in self.pieces.values()):
             return {name: path(0.0) + (path(1.0) - path(0.0)) * law for name, path in self.pieces.items()}
         factorials = np.array([float(factorial(j)) for j in range(k + 1)])
