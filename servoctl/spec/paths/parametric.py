@@ -102,10 +102,11 @@ def _parametric(maker, entries, options, dim):
         )
     for name in base.names if isinstance(base, ParametricPath) else ():
         known.setdefault(name, ca.SX.sym(name))
-    p = ca.vertcat(*known.values())
+    p = ca.vertcat(ca.SX(0, 1), *known.values())
     f = ca.Function("numbers", [p], [ca.densify(column), ca.densify(ca.jacobian(column, p))])
     shapes = {name: shape for name, (_, shape) in entries.items()}
-    return ParametricPath(maker, shapes, options, tuple(known), f.serialize(), dim)
+    path = ParametricPath(maker, shapes, options, tuple(known), f.serialize(), dim)
+    return path if known else path.made({})  # expressions of numbers alone
 
 
 @frozen(eq=False)
