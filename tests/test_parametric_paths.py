@@ -67,6 +67,12 @@ def test_a_path_with_parameters_is_a_value():
     np.testing.assert_allclose(path.at(**numbers)([0.5, 2.0]), same([0.5, 2.0]), rtol=1e-13)
 
 
+def test_expressions_without_parameters_are_numbers():
+    made = sv.paths.rest_to_rest(0.0, ca.SX(2.0), 0.5 * ca.SX(4.0))
+    assert made == sv.paths.rest_to_rest(0.0, 2.0, 2.0) and made * ca.SX(3.0) == 3.0 * made
+    assert 0 * p.end + made == made
+
+
 one = sv.paths.rest_to_rest(0.0, p.end, 1.0)
 BAD = {
     "no number": (lambda: one.at(), SpecificationError, {"missing": ["end"]}),
