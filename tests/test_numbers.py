@@ -118,20 +118,6 @@ def test_negative_an_inertia_is_negative_below_1e_9_of_its_size(excess, negative
         assert sv.derive(mechanism, program).free == 2
 
 
-@pytest.mark.parametrize("height, refused", [(3e-6, True), (3e-7, False)])
-def test_jump_a_path_jumps_above_1e_6_of_its_largest_value_nearby(height, refused):
-    q = sv.coordinates("x")
-    (x,) = q
-    mechanism = sv.Mechanism(q, gibbs=sv.particle(q, 1.0, x), actuators={"force": x})
-    program = sv.Program({"a": x - ca.cos(q.t - 1.0) - height * (q.t > 1.0)})
-    if refused:
-        with pytest.raises(SpecificationError) as caught:
-            sv.derive(mechanism, program)
-        assert caught.value.details["has"] == -1 and caught.value.details["t"] == pytest.approx(1.0)
-    else:
-        assert sv.derive(mechanism, program).free == 0
-
-
 @pytest.mark.parametrize("twist, integrable", [(5e-9, False), (5e-10, True)])
 def test_integrable_a_frame_is_integrable_up_to_1e_9(twist, integrable):
     """The bracket of (1, 0, 0) and (0, 1, ε x) is (0, 0, ε), outside their span."""
