@@ -14,6 +14,7 @@ import numpy as np
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import JETS, REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
+from servoctl.reduction.scales import sizes_of_references
 from servoctl.tolerances import CUTOFF
 from servoctl.values import frozen
 
@@ -350,7 +351,7 @@ def _random_starts(q, level, context):
                 centre[i], spread[i] = value / factorial(k), context.spread * size / factorial(k)
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
     t = rng.uniform(*context.window, (2 * POINTS, 1))
-    r = rng.uniform(-1.0, 1.0, (2 * POINTS, len(q.family) * (JETS + 1)))
+    r = sizes_of_references(q) * rng.uniform(-1.0, 1.0, (2 * POINTS, len(q.family) * (JETS + 1)))
     r = r if context.followed is None else np.tile(context.followed, (2 * POINTS, 1))
     return np.hstack([t, r]).astype(REAL), z
 
