@@ -166,14 +166,14 @@ def motion(model, t=0.0, guess=None, **held):
     """A consistent state at t with its next derivatives: the jets Z, (n_z,); pivots chosen again where they vanish."""
     state = model.start(t, guess=guess, **held)
     if model.flat and model.reduction.top == 2:
-        y = model.function("path")(t, state.values[: model.nq], model.parameters)
+        y = model.function("path")(t, state.values[: model.nq], model.p)
         first = model.nq if model.reduction.mechanism.q.plain else 3 * model.nq  # of γ' (see `Equations.path`)
         return np.concatenate([state.values, y[first + model.n :][: model.n]])
     n_x = len(state.values)
-    rates = model.function("ode")(t, state.values, model.parameters)[:n_x]
+    rates = model.function("ode")(t, state.values, model.p)[:n_x]
     if not np.all(np.isfinite(rates)):
         near = derived_near(model, t, np.append(state.values, np.zeros(model.n)))
-        rates = near.function("ode")(t, state.values, model.parameters)[:n_x]
+        rates = near.function("ode")(t, state.values, model.p)[:n_x]
     return np.append(state.values, rates[-model.n :])
 
 

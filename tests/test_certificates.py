@@ -66,7 +66,7 @@ def worst_of_3_18(run):
         model = run.variant(k)
         n, jets = model.n, run.jets[:, k]
         x = jets[: len(model.state_names)]
-        matrices = model.function("matrices")(run.t[k], x, model.parameters)
+        matrices = model.function("matrices")(run.t[k], x, model.p)
         rows = len(leading_names(model.reduction)[0])
         T = null_space(matrices[rows * n : -n].reshape(n, -1).T)
         worst = max(worst, np.abs(T.T @ balance[:, k]).max(initial=0.0))

@@ -120,7 +120,7 @@ def test_stiff_spring_against_scipy(stiff):
     model, start, _ = stiff
     f, slopes, n = model.function("ode"), model.function("ode_jacobian"), len(start.values)
     reference = solve_ivp(
-        lambda t, x: f(t, x, model.parameters)[:n],
+        lambda t, x: f(t, x, model.p)[:n],
         (0.0, 1.0),
         start.values,
         method=Radau,
