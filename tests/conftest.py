@@ -180,7 +180,7 @@ def motion(model, t=0.0, guess=None, **held):
 def signal(model, kind, t, jets):
     """A group of signals by name at one instant."""
     names, function = model.signals(kind)
-    return dict(zip(names, function(t, jets, model.parameters), strict=True))
+    return dict(zip(names, function(t, jets, model.p), strict=True))
 
 
 # tiers ---------------------------------------------------------------------------------------------------------------

@@ -290,7 +290,7 @@ def test_a_model_near_a_state_is_the_same_model(name, gallery_model):
     expected = signal(model, kind, t, jets)
     assert signal(near, kind, t, jets) == pytest.approx(expected, rel=1e-8, abs=1e-8)
     x = jets[: len(model.state_names)]
-    rates = [m.function("ode")(t, x, m.parameters)[: len(x)] for m in (model, near)]
+    rates = [m.function("ode")(t, x, m.p)[: len(x)] for m in (model, near)]
     assert rates[0] == pytest.approx(rates[1], rel=1e-7, abs=1e-7)
 
 
@@ -299,7 +299,7 @@ def test_a_start_where_a_pivot_vanishes_gets_pivots_of_its_own(name, gallery_mod
     model, scene = gallery_model(name), gallery[name]
     state = model.start(0.0, guess=scene.guess, **scene.start)
     near = derived_near(model, 0.0, np.append(state.values, np.zeros(model.n)))
-    rates = near.function("ode")(0.0, state.values, model.parameters)[: len(state.values)]
+    rates = near.function("ode")(0.0, state.values, model.p)[: len(state.values)]
     assert np.all(np.isfinite(rates))
     reaction = signal(near, "reaction", 0.0, np.append(state.values, rates[-model.n :]))
     assert np.all(np.isfinite(list(reaction.values())))

@@ -23,7 +23,7 @@ def circle():
 
 def functions(model):
     """Pivots and γ'' at (t, X)."""
-    f, p, n_x, n = model.function("ode"), model.parameters, len(model.state_names), model.n
+    f, p, n_x, n = model.function("ode"), model.p, len(model.state_names), model.n
     return lambda t, x: f(t, x, p)[n_x:], lambda t, x: f(t, x, p)[n_x - n : n_x]
 
 

@@ -78,7 +78,7 @@ def counted(monkeypatch, tmp_path):
 @pytest.mark.parametrize("which", ["ideal rates", "ideal accelerations", "least torque beside a bar", "millimetres"])
 def test_pivots_of_definite_matrices_give_the_same_motion(which):
     model, start = begun(which)
-    other, p, x = with_diagonal_pivots(model), model.parameters, start.values
+    other, p, x = with_diagonal_pivots(model), model.p, start.values
     one, two = (m.function("ode")(start.t, x, p)[: len(x)] for m in (model, other))
     assert relative(one, two) < 1e-10
     one, two = (series_loop(m, 6)(start.t, x, np.append(p, start.t))[: 6 * model.n] for m in (model, other))
@@ -99,7 +99,7 @@ def test_where_actuators_reach_every_balance_no_pivot_chooses_among_these():
 def test_error_dynamics_are_the_same_with_them(which):
     model, start = begun(which)
     x = start.values + 1e-3 * np.cos(np.arange(len(start.values)))
-    p = np.append(model.parameters, np.full(sum(model.reduction.raised.values()), 3.0))
+    p = np.append(model.p, np.full(sum(model.reduction.raised.values()), 3.0))
     one, two = (m.function("ode_poles")(start.t, x, p)[: len(x)] for m in (model, with_diagonal_pivots(model)))
     assert relative(one, two) < 1e-10
 
@@ -172,7 +172,7 @@ def test_runs_with_other_pivots_are_saved_and_pickled(which, tmp_path):
     assert loaded == run and [place_of(v) for *_, v in loaded.variants] == [place_of(v) for *_, v in run.variants]
     variant = run.variants[-1][2]
     copy = pickle.loads(pickle.dumps(variant))
-    x, p = start.values, model.parameters
+    x, p = start.values, model.p
     assert copy == variant != model and place_of(copy) == place_of(variant)
     assert np.array_equal(copy.function("ode")(0.0, x, p), variant.function("ode")(0.0, x, p))
 
@@ -203,7 +203,7 @@ def test_parameters_change_with_other_pivots():
     model = sv.derive(mechanism, program)
     other = with_diagonal_pivots(model).with_parameters(l=2.0)
     start = model.with_parameters(l=2.0).start(x=2.0, dz=1.0, dy=0.5)
-    rates = other.function("ode")(0.0, start.values, other.parameters)
+    rates = other.function("ode")(0.0, start.values, other.p)
     assert other.equations.definite and rates[3:6] == pytest.approx([-1.25 / 2, 0.0, -9.81], abs=1e-12)
 
 
@@ -295,5 +295,5 @@ def test_a_variant_that_does_not_serve_other_parameters_is_derived_with_these(sl
     near = derived_near(other, 0.0, jets)
     assert counted["derived"] == derived and pivot_strength(near, 0.0, jets) > 0.3
     assert near is derived_near(other, 0.0, -jets)  # the sign of a zero is no other place
-    rates = near.function("ode")(0.0, jets[: len(model.state_names)], near.parameters)
+    rates = near.function("ode")(0.0, jets[: len(model.state_names)], near.p)
     assert rates[2:4] == pytest.approx(9.81 / (1 + slope**2) * np.array([slope, -1.0]), rel=1e-12)

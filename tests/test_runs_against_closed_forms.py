@@ -32,7 +32,7 @@ def peak(reference, signal, near, sign):
 
 def internal_poles(model, state):
     """Eigenvalues of the reduced motion about an equilibrium, on the tangent of its invariants."""
-    f, invariants, p = model.function("ode"), model.function("invariants"), model.parameters
+    f, invariants, p = model.function("ode"), model.function("invariants"), model.p
     x, n = state.values, len(state.values)
     step = 1e-6 * (1.0 + np.abs(x))
     ends = [[f(state.t, x + s * step[i] * e, p)[:n] for s in (1, -1)] for i, e in enumerate(np.eye(n))]
@@ -297,7 +297,7 @@ def arm_determinant(links, Gamma, q2):
     model = arm(links, Gamma)
     x = np.zeros(4)
     x[[model.state_names.index("q1"), model.state_names.index("q2")]] = np.pi / 2 - Gamma * q2, q2
-    return np.linalg.det(model.function("matrices")(10.0, x, model.parameters)[:4].reshape(2, 2))
+    return np.linalg.det(model.function("matrices")(10.0, x, model.p)[:4].reshape(2, 2))
 
 
 @pytest.mark.parametrize("links", LINKS)

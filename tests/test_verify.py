@@ -338,7 +338,7 @@ def test_the_other_elbow_fails():
     run = sv.simulate(model, model.start(guess=guess), (0.0, 3.0), t_eval=np.linspace(0.0, 3.0, 101))
     bend = run["b"]
     flipped = np.array([run["a"] + 2 * np.arctan2(np.sin(bend), 1 + np.cos(bend)), -bend])
-    y = model.function("path").grid(run.t, flipped, model.parameters)
+    y = model.function("path").grid(run.t, flipped, model.p)
     other = np.concatenate([flipped, y[2:6]])
     assert sv.verify(run).passed
     assert sv.verify(edited(run, jets=other, variants=())).passed, "a motion of its own"
