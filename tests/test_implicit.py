@@ -139,7 +139,7 @@ def test_jacobian_is_that_of_differences(poles, model, start):
     f = model.function("ode_poles" if poles else "ode")
     slopes = model.function("ode_poles_jacobian" if poles else "ode_jacobian")
     n = len(start.values)
-    p = np.append(model.parameters, rng.uniform(1.0, 9.0, f.n_p - len(model.parameters)))
+    p = np.append(model.p, rng.uniform(1.0, 9.0, f.n_p - len(model.p)))
     x, h = start.values + rng.uniform(-0.2, 0.2, n), 1e-6
     numeric = [(f(0.3, x + h * e, p) - f(0.3, x - h * e, p))[:n] / (2 * h) for e in np.eye(n)]
     np.testing.assert_allclose(slopes(0.3, x, p).reshape(n, n), numeric, rtol=1e-7, atol=1e-7)

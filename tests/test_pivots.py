@@ -99,7 +99,7 @@ def test_where_actuators_reach_every_balance_no_pivot_chooses_among_these():
 def test_error_dynamics_are_the_same_with_them(which):
     model, start = begun(which)
     x = start.values + 1e-3 * np.cos(np.arange(len(start.values)))
-    p = np.append(model.parameters, np.full(sum(model.reduction.raised.values()), 3.0))
+    p = np.append(model.p, np.full(sum(model.reduction.raised.values()), 3.0))
     one, two = (m.function("ode_poles")(start.t, x, p)[: len(x)] for m in (model, with_diagonal_pivots(model)))
     assert relative(one, two) < 1e-10
 
@@ -172,7 +172,7 @@ def test_runs_with_other_pivots_are_saved_and_pickled(which, tmp_path):
     assert loaded == run and [place_of(v) for *_, v in loaded.variants] == [place_of(v) for *_, v in run.variants]
     variant = run.variants[-1][2]
     copy = pickle.loads(pickle.dumps(variant))
-    x, p = start.values, model.parameters
+    x, p = start.values, model.p
     assert copy == variant != model and place_of(copy) == place_of(variant)
     assert np.array_equal(copy.function("ode")(0.0, x, p), variant.function("ode")(0.0, x, p))
 

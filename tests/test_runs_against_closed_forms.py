@@ -32,7 +32,7 @@ def peak(reference, signal, near, sign):
 
 def internal_poles(model, state):
     """Eigenvalues of the reduced motion about an equilibrium, on the tangent of its invariants."""
-    f, invariants, p = model.function("ode"), model.function("invariants"), model.parameters
+    f, invariants, p = model.function("ode"), model.function("invariants"), model.p
     x, n = state.values, len(state.values)
     step = 1e-6 * (1.0 + np.abs(x))
     ends = [[f(state.t, x + s * step[i] * e, p)[:n] for s in (1, -1)] for i, e in enumerate(np.eye(n))]
