@@ -359,6 +359,10 @@ def test_high_orders_are_finite_and_right():
     assert found == pytest.approx(float(exact), rel=1e-10)
 
 
+S = ca.MX.sym("s")
+CALLED = ca.Function("f", [S], [ca.interpolant("table", "linear", [[0.0, 1.0]], [0.0, 2.0])(S)], {"never_inline": True})
+
+
 @pytest.mark.parametrize(
     ("build", "word"),
     [
@@ -368,6 +372,7 @@ def test_high_orders_are_finite_and_right():
         (lambda x, y: ca.remainder(x, y), "remainder"),
         (lambda x, y: ca.copysign(x, y), "copysign"),
         (lambda x, y: ca.erfinv(x), "erfinv"),
+        (lambda x, y: CALLED.call([x])[0], "interpolant"),
     ],
 )
 def test_operations_without_a_derivative_are_refused_by_name(build, word):

@@ -156,6 +156,7 @@ _REFUSED = {
     ca.OP_REMAINDER: "remainder",
     ca.OP_COPYSIGN: "copysign",
     ca.OP_ERFINV: "erfinv",
+    ca.OP_CALL: "a function that CasADi calls, such as an interpolant",
 }
 _GROWING = {"exp", "expm1", "sinh", "cosh"}  # functions that leave the range of doubles
 _OPTIONS = {"allow_free": True, "live_variables": False, "max_io": 10**9}  # operations fill new places in order
