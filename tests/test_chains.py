@@ -15,6 +15,7 @@ from servoctl.codegen import emit
 from servoctl.codegen.chains import Constant, short_chains, time_of
 from servoctl.codegen.collecting import ways
 from servoctl.codegen.compiler import library
+from servoctl.codegen.paths import jets_at
 from servoctl.tolerances import EXTENDED
 
 extended = pytest.mark.skipif(not EXTENDED, reason="what is compared with is computed in extended precision")
@@ -209,9 +210,10 @@ IN_LONG_NUMBERS = {
 }  # fmt: skip
 
 
-def evaluated(given, t, x, p):
+def evaluated(given, t, x, p, jets=()):
     """The outputs of statements, in the type of x and p."""
-    values, outputs = {"t": t} | {f"x[{i}]": v for i, v in enumerate(x)} | {f"p[{i}]": v for i, v in enumerate(p)}, {}
+    arrays, outputs = {"x": x, "p": p, "w": jets}, {}
+    values = {"t": t} | {f"{name}[{i}]": v for name, array in arrays.items() for i, v in enumerate(array)}
     for target, operation, operands in given:
         operands = [v.value if isinstance(v, Constant) else values[v] for v in operands]
         if isinstance(target, str):
@@ -244,21 +246,21 @@ def test_collected_rates_are_as_accurate_in_all_units(scene):
 @np.errstate(all="ignore")
 @pytest.mark.parametrize("scene", ("overhead-crane", "vtol", "slung-load", "beam-crane"))
 def test_collected_equations_of_a_path_are_as_accurate(scene, gallery_model):
-    """Against extended precision, at states near the path and on its knots, where conditions decide alike."""
+    """Against extended precision, at states near the path and at its breaks."""
     model = gallery_model(scene)
     f, nq, rng = model.function("path").expression, model.nq, np.random.default_rng(6)
     given = gallery.gallery[scene]
     run = sv.simulate(model, model.start(**given.start, guess=given.guess), given.t_span)
     t, x = run.t, run.jets[:nq] * (1 + 1e-4 * rng.normal(size=(nq, len(run.t))))
-    p = np.broadcast_to(model.parameters[:, None], (len(model.parameters), len(t)))
+    p, r = np.broadcast_to(model.p[:, None], (len(model.p), len(t))), jets_at(f, t, model.p)
     given = emit._statements(f, emit.SCALAR)
-    exact = evaluated(given, t.astype(np.longdouble), x.astype(np.longdouble), p.astype(np.longdouble))
+    exact = evaluated(given, *(part.astype(np.longdouble) for part in (t, x, p, r)))
     finite = np.isfinite(exact).all(axis=0)  # elsewhere a pivot is zero
     size = np.abs(exact[:, finite]).max(axis=1, keepdims=True)
     assert finite.mean() > 0.99
 
     def error(some):
-        off = np.abs(evaluated(some, t, x, p) - exact)[:, finite]
+        off = np.abs(evaluated(some, t, x, p, r) - exact)[:, finite]
         return (off / np.where(size > 0, size, 1.0)).max(axis=0).astype(float)
 
     own, reference = error([*itertools.chain(*emit.by_phase(f, nq))]), error(emit._with_reciprocals(given))

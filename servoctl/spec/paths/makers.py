@@ -38,7 +38,7 @@ def without_time(maker: Any) -> Any:
         plain = {p.name for p in parameters if p.default is p.empty and p.name not in kwargs}
         line = f"sv.paths.{maker.__name__}({', '.join(x if name in plain else f'{name}={x}' for name, x in shown)})"
         raise SpecificationError(
-            f"{maker.__name__} was called with the time {time[1]} before its other arguments.",
+            f"{maker.__name__} was called with {_shown(time[1])} before its other arguments.",
             "It makes a path: data with numbers, which a reference follows in time.",
             nearest=f"{line}.",
             do=f"Write r = q.references(X={line}), and r.X in the program.",
