@@ -16,7 +16,7 @@ from servoctl.jets.tape import JETS, REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
 from servoctl.reduction.scales import ORDINARY
 from servoctl.spec.paths.value import Path
-from servoctl.tolerances import CUTOFF, TINY
+from servoctl.tolerances import CUTOFF
 from servoctl.values import frozen
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is a rounding error
@@ -365,9 +365,8 @@ def _sizes_of_references(q):
         if isinstance(path, Path):
             order, t = min(JETS, path.coefficients.shape[2] - 1), np.linspace(*path.breaks[[0, -1]], PATH_INSTANTS)
             largest = np.abs(path.jets(t, order)[:, 0]).max(axis=1) / np.cumprod([1.0, *range(1, order + 1)])
-            row[: order + 1] = np.where(
-                (largest > 0) & (np.abs(np.log(largest + TINY)) > np.log(ORDINARY)), largest, 1.0
-            )
+            beyond = (largest > ORDINARY) | (largest * ORDINARY < 1)
+            row[: order + 1] = np.where((largest > 0) & beyond, largest, 1.0)
     return sizes.ravel()
 
 
