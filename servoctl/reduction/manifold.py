@@ -359,14 +359,12 @@ def _random_starts(q, level, context):
 
 
 def _sizes_of_references(q):
-    """Largest Taylor coefficients (R (JETS + 1),) of the paths of references; 1 for ordinary ones, and without any."""
+    """Sizes (R (JETS + 1),) of the jets of references: the largest value of each path; 1 for ordinary ones, or none."""
     sizes = np.ones((len(q.family), JETS + 1))
     for row, path in zip(sizes, q.family.paths.values(), strict=True):
         if isinstance(path, Path):
-            order, t = min(JETS, path.coefficients.shape[2] - 1), np.linspace(*path.breaks[[0, -1]], PATH_INSTANTS)
-            largest = np.abs(path.jets(t, order)[:, 0]).max(axis=1) / np.cumprod([1.0, *range(1, order + 1)])
-            beyond = (largest > ORDINARY) | (largest * ORDINARY < 1)
-            row[: order + 1] = np.where((largest > 0) & beyond, largest, 1.0)
+            largest = np.abs(path(np.linspace(*path.breaks[[0, -1]], PATH_INSTANTS))).max()
+            row[:] = largest if largest > ORDINARY or 0 < largest < 1 / ORDINARY else 1.0
     return sizes.ravel()
 
 
