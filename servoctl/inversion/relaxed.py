@@ -23,9 +23,8 @@ from servoctl.checks import (
     positive_number,
     positives,
     require_kind,
-    rows_read,
 )
-from servoctl.control.extremes import excesses, size_of_limit
+from servoctl.control.extremes import as_read, excesses, size_of_limit
 from servoctl.control.nonlinear import words
 from servoctl.errors import (
     IntegrationStopped,
@@ -332,7 +331,7 @@ class Relaxation(Transfer):
                 **facts,
             )
         run = free._as_run(Plan(plan.mesh, plan.pieces, *nlp.apart(w)))
-        _, name, _, t, value, limit = max(excesses(run, self.limits | self._as_read(run)))
+        _, name, _, t, value, limit = max(excesses(run, limits))
         kind = LimitExceeded if facts["status"] == "Infeasible_Problem_Detected" else IntegrationStopped
         return kind(
             f"IPOPT {words(stats)} within the limits and bounds; without them {name} is {value:.5g} at t = {t:.4g} s, "
@@ -401,17 +400,12 @@ class Relaxation(Transfer):
         begins = "" if self.opening is None else "begins on its bounded motion; "
         return replace(run, message=f"finished; {begins}the program is missed by at most {missed}{self._exceeded(run)}")
 
-    def _as_read(self, run):
-        """The bounds by the names under which a run has what they bound: X_residual beside a reference X."""
-        signals = self.plant.mechanism.signals
-        read = {row: name for name, row in rows_read(self.program.names, (*signals, *run.model.paths)).items()}
-        return {name if name in signals else read.get(name, name): sides for name, sides in self.bounds.items()}
-
     def _exceeded(self, run):
         """How far samples between the instants of bounds exceed these, for the message; "" if they do not."""
         text = ""
-        for name, (low, high) in self._as_read(run).items():
-            excess = float(np.max(np.maximum(low - run[name], run[name] - high)))
+        for name, (low, high) in self.bounds.items():
+            values = run[as_read(run, name)]
+            excess = float(np.max(np.maximum(low - values, values - high)))
             if excess > EXCEEDED * size_of_limit(low, high):
                 text += f"; between its instants {name} exceeds its bound by {excess:.2g}"
         return text
