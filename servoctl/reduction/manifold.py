@@ -14,8 +14,9 @@ import numpy as np
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import JETS, REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
-from servoctl.reduction.scales import sizes_of_references
-from servoctl.tolerances import CUTOFF
+from servoctl.reduction.scales import ORDINARY
+from servoctl.spec.paths.value import Path
+from servoctl.tolerances import CUTOFF, TINY
 from servoctl.values import frozen
 
 ROUNDED = 8 * float(np.finfo(REAL).eps)  # a scaled residual below this is a rounding error
@@ -26,6 +27,7 @@ ON_MANIFOLD = 1e-13  # largest scaled residual of a point: far below ENTRY, so t
 GAUSS_NEWTON_STEPS = 60  # on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
 LEVEL_SWEEPS = 2  # a second one, without gradients in all jets, where the first leaves the rounding of its steps
+PATH_INSTANTS = 51  # of a path, at which its size is read
 AIMING_STEPS = 6  # Gauss-Newton steps of q and references together, before the levels
 SHORTENINGS = 12  # quarterings of a step before the search from a start ends
 SPREAD = 0.1  # relative width of starts about a guess, whose size is its value plus its usual size
@@ -351,9 +353,22 @@ def _random_starts(q, level, context):
                 centre[i], spread[i] = value / factorial(k), context.spread * size / factorial(k)
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
     t = rng.uniform(*context.window, (2 * POINTS, 1))
-    r = sizes_of_references(q) * rng.uniform(-1.0, 1.0, (2 * POINTS, len(q.family) * (JETS + 1)))
+    r = _sizes_of_references(q) * rng.uniform(-1.0, 1.0, (2 * POINTS, len(q.family) * (JETS + 1)))
     r = r if context.followed is None else np.tile(context.followed, (2 * POINTS, 1))
     return np.hstack([t, r]).astype(REAL), z
+
+
+def _sizes_of_references(q):
+    """Largest Taylor coefficients (R (JETS + 1),) of the paths of references; 1 for ordinary ones, and without any."""
+    sizes = np.ones((len(q.family), JETS + 1))
+    for row, path in zip(sizes, q.family.paths.values(), strict=True):
+        if isinstance(path, Path):
+            order, t = min(JETS, path.coefficients.shape[2] - 1), np.linspace(*path.breaks[[0, -1]], PATH_INSTANTS)
+            largest = np.abs(path.jets(t, order)[:, 0]).max(axis=1) / np.cumprod([1.0, *range(1, order + 1)])
+            row[: order + 1] = np.where(
+                (largest > 0) & (np.abs(np.log(largest + TINY)) > np.log(ORDINARY)), largest, 1.0
+            )
+    return sizes.ravel()
 
 
 def follows(q, values):

@@ -10,13 +10,10 @@ from math import log
 import casadi as ca
 import numpy as np
 
-from servoctl.jets.tape import JETS
 from servoctl.spec.paths.value import Path
 from servoctl.spec.references import Jets
-from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
-INSTANTS = 51  # of a path, at which its size is read
 ORDINARY = 100.0  # factor from 1 within which sizes of jets and of the time are taken as 1
 WEAK = 0.3  # weight of the size 1 beside that of a term; a guessed size has the weight of a term
 ROUNDS = 12  # of evaluation and least squares; each goes half the way, which converges for rows of any degree up to 3
@@ -167,17 +164,6 @@ def _along_paths(q, rows):
     halves = {name: (path.breaks[0] + path.breaks[-1]) / 2 for name, path in paths.items()}
     values = [paths[name].jets(halves[name], k)[k, 0, 0] if name in paths else 0.0 for name, k in jets.places]
     return ca.substitute(rows, jets.symbols, ca.DM(values)) if len(jets) else rows
-
-
-def sizes_of_references(q):
-    """Largest Taylor coefficients (R (JETS + 1),) of the paths of references; 1 for ordinary ones, and without any."""
-    sizes = np.ones((len(q.family), JETS + 1))
-    for row, path in zip(sizes, q.family.paths.values(), strict=True):
-        if isinstance(path, Path):
-            order, t = min(JETS, path.coefficients.shape[2] - 1), np.linspace(*path.breaks[[0, -1]], INSTANTS)
-            largest = np.abs(path.jets(t, order)[:, 0]).max(axis=1) / np.cumprod([1.0, *range(1, order + 1)])
-            row[: order + 1] = np.where((largest > 0) & (np.abs(np.log(largest + TINY)) > log(ORDINARY)), largest, 1.0)
-    return sizes.ravel()
 
 
 def _balanced(terms, unknowns, logs, wishes, weights):
