@@ -214,7 +214,7 @@ void f_again(double t, const double *x, const double *other, const double *p, do
     np.testing.assert_array_equal(in_buffer(compiled(f, "f", ("rk",)), 0.3, x, p), y)
 
 
-@pytest.mark.parametrize(("name", "share"), [("overhead-crane", 0.2), ("crane-3d", 0.2), ("slung-load", 0.26)])
+@pytest.mark.parametrize(("name", "share"), [("overhead-crane", 0.27), ("crane-3d", 0.2), ("slung-load", 0.26)])
 def test_a_newton_correction_takes_few_of_the_operations_of_a_point(gallery_model, name, share):
     f = gallery_model(name).function("path")
     text = emit.phases(f.expression, "f", emit.by_phase(f.expression, f.n_x), chunk=10**9)

@@ -117,3 +117,13 @@ def test_designs_are_those_along_a_formula():
         for formula in (True, False)
     ]
     assert repr(found[0]) == repr(found[1])
+
+
+def test_a_bound_of_a_residual_is_not_one_of_the_reference_with_its_name():
+    """The exact plan has X - r = 0: 10 mm bound the residual, not the path, which goes to 3 m."""
+    q = sv.coordinates("x y")
+    x, y = q
+    mechanism = sv.Mechanism(q, sv.particle(q, 2.0, [x, y]), 0, {"fx": x, "fy": y})
+    program = sv.Program({"X": x - q.references(X=sv.paths.rest_to_rest(0.0, 3.0, 2.0)).X, "Y": y})
+    run = sv.inverse(mechanism, program, (0.0, 2.0), bounds={"X": 0.01})
+    assert run.method == "algebraic" and run["X"][-1] == pytest.approx(3.0)

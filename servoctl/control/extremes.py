@@ -25,10 +25,16 @@ def extremes(run, name):
 def excesses(run, limits):
     """(excess relative to the limit, signal, side, instant [s], value, limit) at each side of (low, high) by signal."""
     for name, (low, high) in limits.items():
-        (least, t_least), (most, t_most) = extremes(run, name)
+        (least, t_least), (most, t_most) = extremes(run, as_read(run, name))
         size = size_of_limit(low, high) or max(abs(least), abs(most)) or 1.0
         for excess, *where in ((low - least, "lower", t_least, least, low), (most - high, "upper", t_most, most, high)):
             yield np.inf if np.isnan(excess) else float(excess / size), name, *where
+
+
+def as_read(run, name):
+    """The name by which a run has what a limit or bound names: the residual X, beside a reference X, is X_residual."""
+    both = name in run.model.paths and name in run.residual and name not in run.model.reduction.mechanism.signals
+    return f"{name}_residual" if both else name
 
 
 def size_of_limit(low, high):

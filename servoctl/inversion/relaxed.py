@@ -24,7 +24,7 @@ from servoctl.checks import (
     positives,
     require_kind,
 )
-from servoctl.control.extremes import excesses, size_of_limit
+from servoctl.control.extremes import as_read, excesses, size_of_limit
 from servoctl.control.nonlinear import words
 from servoctl.errors import (
     IntegrationStopped,
@@ -404,7 +404,8 @@ class Relaxation(Transfer):
         """How far samples between the instants of bounds exceed these, for the message; "" if they do not."""
         text = ""
         for name, (low, high) in self.bounds.items():
-            excess = float(np.max(np.maximum(low - run[name], run[name] - high)))
+            values = run[as_read(run, name)]
+            excess = float(np.max(np.maximum(low - values, values - high)))
             if excess > EXCEEDED * size_of_limit(low, high):
                 text += f"; between its instants {name} exceeds its bound by {excess:.2g}"
         return text
