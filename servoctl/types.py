@@ -10,6 +10,7 @@ from servoctl.inversion.output import MinimumPhase
 from servoctl.inversion.report import Report
 from servoctl.model.model import Model
 from servoctl.model.start import State
+from servoctl.model.streaming import Feedforward
 from servoctl.plants.plant import Plant
 from servoctl.robots.robot import Frame, Robot
 from servoctl.run import Run
@@ -17,7 +18,6 @@ from servoctl.sensitivities.identification import Identification
 from servoctl.sensitivities.sensitivity import Sensitivity
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.parameters import Parameters
-from servoctl.streaming import Feedforward
 from servoctl.study.batch import Batch
 from servoctl.study.stability_map import StabilityMap
 from servoctl.study.table import Study

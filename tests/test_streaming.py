@@ -9,6 +9,7 @@ import servoctl as sv
 from servoctl.errors import NameUnknown, SpecificationError
 
 HZ = 1000.0
+EXACT = {"rtol": 1e-9, "atol": 1e-9}  # of solve_ivp
 
 
 def jets_at(model, step):
@@ -76,7 +77,7 @@ def test_references_are_inputs_of_a_system_of_python_control():
 
     def off(count):  # inputs are linear between instants: errors fall with the square of their distance
         t = np.linspace(0.0, 1.0, count)
-        response = control.input_output_response(system, t, path.jets(t, 2)[:, 0], start.values)
+        response = control.input_output_response(system, t, path.jets(t, 2)[:, 0], start.values, solve_ivp_kwargs=EXACT)
         return np.abs(response.outputs[1][:: (count - 1) // 50] - run["theta"]).max()
 
     assert off(201) < off(51) / 12 < 1e-3

@@ -49,7 +49,7 @@ def test_compiled_and_interpreted_steps_are_the_same(name, span, unlike, gallery
     scene, model = gallery[name], gallery_model(name)
     start = model.start(t=span[0], **scene.start, guess=scene.guess)
     f, top = series_loop(model, 11), model.reduction.top
-    p = np.append(model.parameters, 0.25)
+    p = np.append(model.p, 0.25)
     atol = np.geomspace(1e-9, 1e-13, len(start.values)) if unlike else 1e-9
     log = f.taylor(span[0], start.values, span[1], p, 1e-7, atol, 100)
     f._place(f._interpreter, span[0], start.values, p)
@@ -227,7 +227,7 @@ def test_balances_in_independent_velocities_give_the_same_series_by_fewer_produc
 
 
 def test_balances_stay_as_given_where_nothing_is_gained_or_pivots_are_chosen(gallery_model):
-    assert in_independent(gallery_model("cart-pole").equations) is None
+    assert in_independent(gallery_model("mass-on-car").equations) is None
     model, _ = appell_hamel()
     chosen = tuple((k, k) for k in range(model.n))
     assert in_independent(Equations(model.reduction.with_order(chosen))) is None

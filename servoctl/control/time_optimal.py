@@ -38,7 +38,6 @@ SPLINE = (9, 80)  # the degree and the intervals of its spline
 MISSED = (1e-12, 1e-8)  # of its extent: by which the polynomial, and the spline, may miss it
 FITTED = 1e-7  # error of a derivative of references along a law, of its largest value: rounding of class 6 has 2e-8
 PANELS, GAUSS = 2000, np.polynomial.legendre.leggauss(8)  # of the arc length; of a quadrature in each panel
-BESIDE = 1e-9  # of the span: an end of it
 LEAST = 1e-4  # duration, relative to that of the first motion
 
 
@@ -164,7 +163,7 @@ class Curve:
             return series * factorials[:, None]
 
         for name, path in self.pieces.items():
-            if len(rough := path.breaks_below(k, BESIDE, 1 - BESIDE)):
+            if rough := [s for s in path.breaks_below(k, 0.0, 1.0).tolist() if 0 < s < 1]:
                 what = f"turns at {rough[0]:.3g} of its span with fewer than {k} continuous derivatives"
                 raise self._refused(f"The path of {name}", what, name)
         if all(path.coefficients.shape[::2] == (1, 2) for path in self.pieces.values()):

@@ -77,7 +77,7 @@ def p_with(model, parameters):
 
 def moved_by(model, names):
     """Pairs (reference, parameter) of the paths that contain some of the parameters, by their names."""
-    written = _written(model)
+    written = _names_in_paths(model)
     return tuple((r, n) for r, path in model.paths.items() for n in names if written.get(n) in parameters_of(path))
 
 
@@ -89,7 +89,7 @@ def p_with_rates(model, pairs):
     if pairs not in known:
         rates = []
         for reference in dict.fromkeys(r for r, _ in pairs):  # pairs are in their order
-            of = [_written(model)[name] for r, name in pairs if r == reference]
+            of = [_names_in_paths(model)[name] for r, name in pairs if r == reference]
             rates += model.paths[reference].source.rates(_numbers_in_paths(model), of)
         known[pairs] = Followed([*model._followed.paths, *(rate.held() for rate in rates)])
     return with_place((known[pairs].address,), model.parameters)
@@ -100,7 +100,7 @@ def instant_by(model, name, t):
 
     SpecificationError where breaks of several paths meet that move differently.
     """
-    rates, written = {}, _written(model)[name]
+    rates, written = {}, _names_in_paths(model)[name]
     for reference, path in model.paths.items():
         k = int(np.argmin(np.abs(path.breaks - t)))
         if path.classes[k] <= model.reduction.follows[reference] and abs(path.breaks[k] - t) <= SAME * abs(t):
@@ -117,7 +117,7 @@ def instant_by(model, name, t):
     return next(iter(rates.values()), None)
 
 
-def _written(model):
+def _names_in_paths(model):
     """Names of the parameters as paths have them, by those of the model."""
     parameters = model.reduction.mechanism.parameters
     return {name: symbol.name() for name, symbol in zip(parameters.names, parameters.symbols, strict=True)}
@@ -125,7 +125,7 @@ def _written(model):
 
 def _numbers_in_paths(model):
     """Values of the parameters as paths have them."""
-    return dict(zip(_written(model).values(), model.parameters.tolist(), strict=True))
+    return dict(zip(_names_in_paths(model).values(), model.parameters.tolist(), strict=True))
 
 
 def instants_of(model, t):

@@ -34,7 +34,7 @@ from servoctl.spec.references import other_paths, paths_at, required_paths
 from servoctl.values import evenly, read_only
 
 if TYPE_CHECKING:
-    from servoctl.streaming import Feedforward
+    from servoctl.model.streaming import Feedforward
 
 SAMPLED = 50  # samples of a run at which its structure is decided; each takes tens of milliseconds
 
@@ -367,7 +367,7 @@ class Model(Detailed):
         SpecificationError
             If the model follows no references, the start is none, or the rate is not positive.
         """
-        from servoctl.streaming import Feedforward
+        from servoctl.model.streaming import Feedforward
 
         if not self.paths:
             raise SpecificationError(

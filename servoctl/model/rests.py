@@ -82,6 +82,7 @@ class Rests:
             best, least = (z, largest) if largest < least else (best, least)
             last, z = z, z + self._step(rows, slopes, movable, weights, movable & False if angles is None else angles)
             if np.all(np.abs(z - last) <= ENTRY * (1.0 + np.abs(last))):  # no step leads on
+                best = z if best is last else best
                 break
         rows, _, off = (part[some] for part in self.measured(t, best, p))
         if not len(rows):

@@ -8,7 +8,7 @@ from servoctl.jets.overflow import settled
 from servoctl.model.model import derive
 from servoctl.plants.plant import made_again
 from servoctl.spec.paths import Path, polynomials
-from servoctl.spec.paths.limited import limited
+from servoctl.spec.paths.limited import within_limits
 from servoctl.spec.paths.parametric import ParametricPath
 from servoctl.spec.program import no_program
 from servoctl.spec.references import followed_path
@@ -50,7 +50,7 @@ def _expressions(q, values, limits):
     """
     paths = {n: followed_path(n, value) for n, value in values.items() if isinstance(value, (Path, ParametricPath))}
     cut = {name: sides for name, sides in limits.items() if not isinstance(values[name], Path)}
-    paths |= {n: limited(paths[n].held(), *sides) for n, sides in limits.items() if n in paths and n not in cut}
+    paths |= {n: within_limits(paths[n].held(), *sides) for n, sides in limits.items() if n in paths and n not in cut}
     clock = {CLOCK: polynomials([0.0, 1.0], [[1.0], [0.0]], before="continue", after="continue")} if cut else {}
     q, r = q.beside(**{f"{name}_path": path for name, path in paths.items()}, **clock)
     inputs = {name: r[f"{name}_path"] if name in paths else _expression(name, values[name], q.t) for name in values}

@@ -265,7 +265,17 @@ class Coordinates:
         return self.family.add(paths)
 
     def beside(self, **paths):
-        """The same coordinates with further references of their own, and the symbols of these: (q, r)."""
+        """The same coordinates with further references of their own.
+
+        Parameters
+        ----------
+        **paths : Path or None
+            By the names of the references.
+
+        Returns
+        -------
+        (Coordinates, References)
+        """
         other = object.__new__(Coordinates)
         vars(other).update(vars(self), family=self.family.again())
         return other, other.references(**paths)

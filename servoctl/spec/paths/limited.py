@@ -5,7 +5,7 @@ import numpy as np
 from servoctl.spec.paths.value import SAME, Path
 
 
-def limited(path, low, high):
+def within_limits(path, low, high):
     """A path of one component that stays at a limit where it would exceed it; of class 0 where it reaches one."""
     met = _instants_at(path, low, high)
     breaks = np.unique(np.concatenate([path.breaks, met]))

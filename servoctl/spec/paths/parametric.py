@@ -8,7 +8,7 @@ is a polynomial of the same degree on the same piece: a further row of the table
 """
 
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -16,9 +16,6 @@ import numpy as np
 from servoctl.checks import by_name, column, finite, positive, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.values import Value, frozen
-
-if TYPE_CHECKING:
-    from servoctl.spec.paths.value import Path
 
 
 @frozen(eq=False)
@@ -40,13 +37,13 @@ class ParametricPath(Value):
         The function of the parameters that returns A (dim, n), b, t0 and T, serialised.
     """
 
-    base: "Path"
+    base: Any
     names: tuple
     dim: int
     content: str
     __array_ufunc__ = None  # as of `Path`
 
-    def at(self, **numbers: float) -> "Path":
+    def at(self, **numbers: float) -> Any:
         """The path with numbers of its parameters.
 
         Parameters
@@ -81,7 +78,7 @@ class ParametricPath(Value):
 
     def _forms(self):
         """A, b, t0 and T as expressions of symbols with the names of the parameters."""
-        return self._function(ca.vertcat(*(ca.SX.sym(name) for name in self.names)))
+        return self._function(ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(name) for name in self.names)))
 
     def made(self, numbers):
         """The path with numbers of the parameters by name, among others."""
@@ -208,13 +205,19 @@ class ParametricPath(Value):
 
 def parametric(base, A, b, t0=0.0, T=1.0):
     """The path A P((t - t0)/T) + b of a path P of numbers, with expressions A (dim, n), b (dim,), t0 and T."""
+    path = expressed(base, A, b, t0, T)
+    return path if path.names else path.made({})
+
+
+def expressed(base, A, b, t0=0.0, T=1.0):
+    """The same path, also where its expressions contain no parameter."""
     forms = [ca.densify(ca.SX(part)) for part in (A, b, t0, T)]
-    known = {}
-    symbols = ca.symvar(ca.vertcat(*map(ca.vec, forms)))
+    known, symbols = {}, ca.symvar(ca.vertcat(*map(ca.vec, forms)))
     for symbol in symbols:
         known.setdefault(symbol.name(), symbol)  # parameters of a path are known by their names
-    forms = ca.substitute(forms, [ca.vertcat(*symbols)], [ca.vertcat(*(known[s.name()] for s in symbols))])
-    f = ca.Function("numbers", [ca.vertcat(*known.values())], forms)
+    same = ca.vertcat(ca.SX(0, 1), *(known[s.name()] for s in symbols))
+    forms = ca.substitute(forms, [ca.vertcat(ca.SX(0, 1), *symbols)], [same])
+    f = ca.Function("numbers", [ca.vertcat(ca.SX(0, 1), *known.values())], forms)
     return ParametricPath(base, tuple(known), forms[0].size1(), f.serialize())
 
 
@@ -224,4 +227,4 @@ def varies(value):
         return value.dtype == object and any(map(varies, value.ravel()))
     if isinstance(value, (list, tuple)):
         return any(map(varies, value))
-    return isinstance(value, ca.SX) and not value.is_constant()
+    return isinstance(value, ca.SX)

@@ -6,7 +6,7 @@ import numpy as np
 
 from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths.parametric import ParametricPath, parametric, varies
+from servoctl.spec.paths.parametric import ParametricPath, expressed, varies
 from servoctl.values import Value, frozen, read_only
 
 RULES = ("hold", "continue", "periodic", None)
@@ -165,7 +165,7 @@ class Path(Value):
 
     def _parametric(self):
         """The same path, whose numbers may become expressions."""
-        return parametric(self._with(), np.eye(self.dim), np.zeros(self.dim))
+        return expressed(self._with(), np.eye(self.dim), np.zeros(self.dim))
 
     def held(self):
         """The path that is held outside where nothing was said of it."""

@@ -3,12 +3,10 @@
 import numpy as np
 
 from servoctl.checks import as_numbers, by_name, positive, require_kind
-from servoctl.errors import SpecificationError
-from servoctl.methods.choice import Algebraic, RungeKutta
+from servoctl.codegen.loops import CORRECTED, CORRECTIONS
+from servoctl.errors import IntegrationStopped, SpecificationError
 from servoctl.model.jets import with_highest
-from servoctl.model.model import including
 from servoctl.model.start import State
-from servoctl.simulation import simulated
 from servoctl.spec.paths.fit import through_jets
 from servoctl.spec.paths.value import Path
 
@@ -32,10 +30,17 @@ class Feedforward:
     """
 
     def __init__(self, model, start, rate):
-        self._model = including(model, require_kind(State, "start", start, "model.start(...)").names)
+        self._model, start = model, require_kind(State, "start", start, "model.start(...)")
+        if start.names != model.state_names:
+            raise SpecificationError(
+                f"The start has the values {', '.join(start.names)}.",
+                f"The state of this model is {', '.join(model.state_names)}.",
+                do="Start without coordinates that the program leaves out.",
+                names=start.names,
+            )
         self._begin, self._state, self._period = start.t, start.values, 1.0 / positive("rate", rate)
         self._count, self._before = 0, None
-        self.orders = {name: max(order, 0) for name, order in self._model.reduction.follows.items()}
+        self.orders = {name: max(order, 0) for name, order in model.reduction.follows.items()}
 
     @property
     def t(self):
@@ -63,27 +68,48 @@ class Feedforward:
         ------
         SpecificationError
             If a reference is missing or unknown, has too few derivatives, or a number that is not finite.
-        ServoError
-            As `simulate` does, where the machine cannot follow. The sample is not taken then.
+        IntegrationStopped
+            Where the machine cannot follow. The sample is not taken then.
         """
         jets, t = self._checked(jets), self.t
         model = self._model.with_references(**{name: _beside(t, r) for name, r in jets.items()})
-        if self._model.flat:
-            state = self._followed(model, t, Algebraic())
-        elif self._before is None:
-            state = self._state
-        else:
-            between = {name: _between((t - self._period, t), self._before[name], r) for name, r in jets.items()}
-            state = self._followed(self._model.with_references(**between), t, RungeKutta(4, self._period))
+        state = self._solved(model, t) if model.flat else self._integrated(jets, t)
         names, f = model.signals("reaction" if model.reduction.ideal else "actuation")
         forces = f(t, with_highest(model, np.array([t]), state[:, None])[:, 0], model.p)
+        if not np.isfinite([*state, *forces]).all():
+            raise IntegrationStopped(
+                f"The machine cannot follow the references at t = {t:g} s.",
+                "A motion goes on as far as its equations have a solution.",
+                do="Keep the references within the machine's reach, and their jets those of one path.",
+                t=t,
+            )
         self._state, self._before, self._count = state, jets, self._count + 1
         return dict(zip(names, forces.tolist(), strict=True))
 
-    def _followed(self, model, t, method):
-        """The state at the sample at t [s], from that a period before."""
-        run = simulated(model, self._state, (t - self._period, t), method, t_eval=[t], progress=False)
-        return run.jets[: len(model.state_names), -1]
+    def _solved(self, model, t):
+        """The state of a flat program at t [s], by Newton's method from that of the last sample; NaN without one."""
+        f, nq, n = model.function("path"), model.nq, model.n
+        first, q = nq if model.reduction.mechanism.q.plain else 3 * nq, self._state[:nq]
+        for _ in range(CORRECTIONS):
+            y = f(t, q, model.p)
+            q = q + y[:nq]
+            if np.all(np.abs(y[:nq]) <= CORRECTED * (1.0 + np.abs(q))):
+                return np.concatenate([q, f(t, q, model.p)[first : first + n]])
+        return np.full(nq + n, np.nan)
+
+    def _integrated(self, jets, t):
+        """The state at t [s], by a Runge-Kutta step along the polynomials from the last sample, and its projection."""
+        if self._before is None:
+            return self._state
+        h, ends = self._period, (t - self._period, t)
+        paths = {name: _between(ends, self._before[name], r) for name, r in jets.items()}
+        model, x = self._model.with_references(**paths), self._state
+        f, p = model.function("ode_projected"), model.p
+        k1 = f(ends[0], x, p)[: len(x)]
+        k2 = f(t - h / 2, x + h / 2 * k1, p)[: len(x)]
+        k3 = f(t - h / 2, x + h / 2 * k2, p)[: len(x)]
+        k4 = f(t, x + h * k3, p)[: len(x)]
+        return f.restore(t, x + h / 6 * (k1 + 2 * (k2 + k3) + k4), p)
 
     def _checked(self, jets):
         """Jets (order + 1,) of each reference that the forces need, by name."""
