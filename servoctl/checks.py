@@ -45,8 +45,10 @@ def column(value, what, *sizes):
         kind = type(value).__name__
         raise SpecificationError(
             f"{what} is a {kind}, not an expression.",
-            "Specifications are numbers, or CasADi SX expressions of the coordinates, parameters and t.",
-            do="Build it from the symbols with CasADi's functions (ca.sin, ca.sqrt, ca.vertcat, ...).",
+            "Specifications are numbers, or CasADi SX expressions of the coordinates, references, parameters and t.",
+            do="Write r = q.references(X=path), and r.X here."
+            if kind.endswith("Path")
+            else "Build it from the symbols with CasADi's functions (ca.sin, ca.sqrt, ca.vertcat, ...).",
             what=what,
             type=kind,
         ) from error

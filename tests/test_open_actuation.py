@@ -137,8 +137,10 @@ def two_trolleys(weights=None, toward=None, rope="relative"):
     mechanism, program = overhead_crane(coordinates=rope)
     old, q = mechanism.q, sv.coordinates(f"{' '.join(mechanism.q.names)} s")
     s = list(q)[-1]
-    known = ca.vertcat(old.t, *old, *old.gamma(1), *old.gamma(2))
-    new = ca.vertcat(q.t, *(x for k in range(3) for x in (list(q) if k == 0 else q.gamma(k))[: old.n]))
+    (ours, theirs), levels = (q.references(**old.family.paths), old.family), range(3)
+    known = ca.vertcat(old.t, *old, *old.gamma(1), *old.gamma(2), *(theirs.jet(n, k) for k in levels for n in ours.names))
+    new = (x for k in levels for x in (list(q) if k == 0 else q.gamma(k))[: old.n])
+    new = ca.vertcat(q.t, *new, *(r for k in levels for r in ours.d(k)))
     constraints = {name: ca.substitute(e, known, new) for name, e in mechanism.constraints.items()}
     machine = sv.Mechanism(
         q, balance=ca.vertcat(ca.substitute(mechanism.balance, known, new), 20.0 * q.d(2)[-1]), constraints=constraints,

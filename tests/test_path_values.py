@@ -15,7 +15,7 @@ from scipy import interpolate as si
 import servoctl as sv
 from servoctl.errors import NameUnknown, SpecificationError
 from servoctl.spec.paths import Path, as_path, fit, function, polynomials, rest_to_rest, s_curve, spline, trapezoid
-from servoctl.spec.paths.limited import limited
+from servoctl.spec.paths.limited import within_limits
 
 RNG = np.random.default_rng(28)
 TIMES = np.array([0.5, 1.5, 2.0, 4.0, 5.0, 5.7, 6.9, 8.0, 8.6, 9.5, 10.0, 11.2])
@@ -647,7 +647,7 @@ def test_where_a_path_rests_its_derivatives_are_zero_to_the_last_bit():
 def test_within_limits_a_path_is_cut_off_exactly(outside, sides):
     rng, t = np.random.default_rng(1), np.linspace(-3.0, 5.0, 2001)
     path = polynomials([0.0, 0.5, 1.3, 2.0], 3.0 * rng.normal(size=(5, 3)), before=outside, after=outside)
-    found = limited(path, *sides)
+    found = within_limits(path, *sides)
     assert np.abs(found(t) - path(t).clip(*sides)).max() < 1e-12 and found.classes.min() >= -1
 
 

@@ -21,7 +21,7 @@ def breaks_within(model, span, smoother=SMOOTHER):
     That are `smoother` more than the actuation contains. SpecificationError where it has fewer than these.
     """
     low, high, found = min(span), max(span), set()
-    for name, path in model.paths.items():
+    for name, path in required_paths(model.paths).items():
         needs = model.reduction.follows[name]
         require_class(name, path, needs, (low, high), model.reduction.program.jumps)
         found |= {*path.held().breaks_below(needs + smoother, low, high).tolist()}

@@ -23,6 +23,7 @@ import numpy as np
 
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.errors import SpecificationError
+from servoctl.reduction.manifold import sizes_of_references
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.packing import packed, unpacked
@@ -131,7 +132,8 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
             [(name, float(value)) for name, value in (guess or {}).items()],
             None if near is None else float(t),
             *([(name, float(value)) for name, value in some.items()] for some in (state, sizes)),
-            np.asarray(mechanism.parameters.values() if values is None else values, dtype=float).tolist(),
+            (numbers := np.asarray(mechanism.parameters.values() if values is None else values, dtype=float)).tolist(),
+            sizes_of_references(mechanism.q, mechanism.parameters.symbols, numbers).tolist(),
         ]
         chosen = (*program.weights.values(), *program.toward.values())
         residuals = [*program.residuals.values(), *program.with_turns.values()]

@@ -15,7 +15,7 @@ from servoctl.jets.series import Flow
 from servoctl.jets.tape import JETS, REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
 from servoctl.reduction.scales import ORDINARY
-from servoctl.spec.paths.value import Path
+from servoctl.spec.paths.value import parameters_of, path_at
 from servoctl.tolerances import CUTOFF
 from servoctl.values import frozen
 
@@ -353,19 +353,21 @@ def _random_starts(q, level, context):
                 centre[i], spread[i] = value / factorial(k), context.spread * size / factorial(k)
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
     t = rng.uniform(*context.window, (2 * POINTS, 1))
-    r = _sizes_of_references(q) * rng.uniform(-1.0, 1.0, (2 * POINTS, len(q.family) * (JETS + 1)))
+    sizes = np.repeat(sizes_of_references(q, context.parameters, context.values), JETS + 1)
+    r = sizes * rng.uniform(-1.0, 1.0, (2 * POINTS, len(sizes)))
     r = r if context.followed is None else np.tile(context.followed, (2 * POINTS, 1))
     return np.hstack([t, r]).astype(REAL), z
 
 
-def _sizes_of_references(q):
-    """Sizes (R (JETS + 1),) of the jets of references: the largest value of each path; 1 for ordinary ones, or none."""
-    sizes = np.ones((len(q.family), JETS + 1))
-    for row, path in zip(sizes, q.family.paths.values(), strict=True):
-        if isinstance(path, Path):
+def sizes_of_references(q, parameters, values):
+    """Largest values (R,) of paths of references, with values (n_p,) of parameters; 1 if ordinary, or for none."""
+    sizes, numbers = np.ones(len(q.family)), dict(zip((p.name() for p in parameters), values, strict=True))
+    for i, given in enumerate(q.family.paths.values()):
+        path = path_at(given, numbers) if {*parameters_of(given)} <= numbers.keys() else None
+        if path is not None:
             largest = np.abs(path(np.linspace(*path.breaks[[0, -1]], PATH_INSTANTS))).max()
-            row[:] = largest if largest > ORDINARY or 0 < largest < 1 / ORDINARY else 1.0
-    return sizes.ravel()
+            sizes[i] = largest if largest > ORDINARY or 0 < largest < 1 / ORDINARY else 1.0
+    return sizes
 
 
 def follows(q, values):

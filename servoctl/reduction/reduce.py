@@ -13,7 +13,7 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.manifold import Context, Points, at_nominal_size, follows, sample
+from servoctl.reduction.manifold import Context, Points, at_nominal_size, follows, sample, sizes_of_references
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
@@ -192,7 +192,8 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     plain, errors = guess is None if near else all(map(_ordinary, filter(None, (guess or {}).values()))), {}
     for scaled in (not plain,) if near else (not plain, plain):  # a guess far from the origin tells no size
-        scales = usual(mechanism, program, guess or {}, values, _window) if scaled else None
+        sizes = sizes_of_references(mechanism.q, mechanism.parameters.symbols, values)
+        scales = usual(mechanism, program, guess or {}, values, _window, sizes) if scaled else None
         if errors and scaled and scales.ordinary:
             break
         try:

@@ -10,7 +10,6 @@ from math import log
 import casadi as ca
 import numpy as np
 
-from servoctl.spec.paths.value import Path
 from servoctl.spec.references import Jets
 from servoctl.values import frozen
 
@@ -41,13 +40,13 @@ class Scales:
         return np.concatenate([self.coordinates, *(self.rates / self.time**k for k in range(1, level + 1))])
 
 
-def usual(mechanism, program, guess, values, window):
+def usual(mechanism, program, guess, values, window, references):
     """The scales of a specification; sizes that are ordinary are 1.
 
     `guess` has values of jets by name, `values` (n_p,) are parameters, and `window` gives the window of times
-    (t0, t1) [s] for a time scale.
+    (t0, t1) [s] for a time scale; `references` (R,) are the sizes of these.
     """
-    terms = _Terms(mechanism, program, values)
+    terms = _Terms(mechanism, program, values, references)
     if terms.f.has_free():
         return Scales(np.ones(mechanism.q.nq), np.ones(mechanism.q.n))
     wishes, weights = terms.wishes(guess)
@@ -71,7 +70,7 @@ class _Terms:
     `unknowns` says what they add to the logarithm of each term: of a jet, of a constant, of the time.
     """
 
-    def __init__(self, mechanism, program, values):
+    def __init__(self, mechanism, program, values, references):
         q = self.q = mechanism.q
         rows = [*program.residuals.values(), *mechanism.constraints.values(), *mechanism.balance.elements()]
         rows = ca.vertcat(*rows, *q.invariants.values())
@@ -79,7 +78,8 @@ class _Terms:
         if not q.plain:  # q' = V γ' + h are rows, too
             motion = ca.SX.sym("motion", q.nq)
             rows = ca.vertcat(rows, motion - q.V @ q.jet(1) - q.h)
-        rows = _along_paths(q, rows)
+        jets, sizes = Jets(q, [rows]), dict(zip(q.family.names, references, strict=True))
+        rows = ca.substitute(rows, jets.symbols, ca.DM([sizes[name] * (k == 0) for name, k in jets.places]))
         self.names = [name for k in range(self.level + 1) for name in q.jet_names(k)]
         jets = ca.vertcat(*(q.jet(k) for k in range(self.level + 1)), motion)
         arguments = [q.t, jets, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)]
@@ -155,15 +155,6 @@ class _Terms:
         changes[~(changes > FELT * np.abs(here))] = np.nan
         terms = np.column_stack([changes, np.abs(rows[:, -1]), np.abs(slopes[:, -2]) * time])
         return np.where(np.isfinite(terms) & (terms > 0), terms, np.nan)
-
-
-def _along_paths(q, rows):
-    """Rows with numbers for references: those of their paths half way, zero where there is none of numbers."""
-    jets = Jets(q, [rows])
-    paths = {name: path for name, path in q.family.paths.items() if isinstance(path, Path)}
-    halves = {name: (path.breaks[0] + path.breaks[-1]) / 2 for name, path in paths.items()}
-    values = [paths[name].jets(halves[name], k)[k, 0, 0] if name in paths else 0.0 for name, k in jets.places]
-    return ca.substitute(rows, jets.symbols, ca.DM(values)) if len(jets) else rows
 
 
 def _balanced(terms, unknowns, logs, wishes, weights):

@@ -669,7 +669,7 @@ def _require_no_switch(expression, q, what):
     branches = Branches(lambda symbol: q.where(symbol) == q.where(q.t))
     branches.smooth(ca.SX(expression).elements())
     for switch in branches.switches:
-        if not any(map(q.is_jet, ca.symvar(switch.function))):
+        if not any(map(q.moves, ca.symvar(switch.function))):
             raise SpecificationError(
                 f"{what[0].upper()}{what[1:]} switches with the time alone, where {switch.text}.",
                 "Formulas of q.t are smooth; a signal that switches is a path, which knows its instants.",

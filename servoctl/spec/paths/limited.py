@@ -11,13 +11,15 @@ def within_limits(path, low, high):
     breaks = np.unique(np.concatenate([path.breaks, met]))
     breaks = breaks[np.append(True, np.diff(breaks) > SAME * np.abs(breaks).max())]
     own = np.clip(np.searchsorted(path.breaks, breaks), 0, len(path.breaks) - 1)
-    classes = np.where(path.breaks[own] == breaks, path.classes[own], 0.0)
+    classes = np.where(path.breaks[own] == breaks, path.classes[own], np.inf)
     half = np.diff(breaks) / 2
     middles = breaks[:-1] + half
     table = path._taylor(middles, path.coefficients.shape[2] - 1, half, middles)
-    for limit, beyond in ((low, table[0] < low), (high, table[0] > high)):
-        table[:, beyond] = 0.0
-        table[0, beyond] = limit
+    sides = np.where(table[0] < low, -1, np.where(table[0] > high, 1, 0))[:, 0]  # of the limits
+    for side, limit in ((-1, low), (1, high)):
+        table[:, sides == side] = 0.0
+        table[0, sides == side] = limit
+    classes[1:-1][np.diff(sides) != 0] = np.minimum(classes[1:-1][np.diff(sides) != 0], 0.0)
     return Path(breaks, table.transpose(1, 2, 0), classes, path.before, path.after)
 
 
@@ -35,5 +37,6 @@ def _instants_at(path, low, high):
 
 def _roots(c, limit):
     """The real places at which a polynomial (size,) has a value."""
-    roots = np.polynomial.polynomial.polyroots(np.trim_zeros([c[0] - limit, *c[1:]], "b"))
+    c = np.trim_zeros([c[0] - limit, *c[1:]], "b")
+    roots = np.polynomial.polynomial.polyroots(c) if len(c) > 1 else np.zeros(0)
     return roots[np.isreal(roots)].real

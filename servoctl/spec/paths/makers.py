@@ -33,6 +33,8 @@ def without_time(maker: Any) -> Any:
             given = timed.bind(*args, **kwargs).arguments
         except TypeError:
             return maker(*args, **kwargs)
+        if not isinstance(given["t"], ca.SX):
+            return maker(*args, **kwargs)
         time, *others = given.items()
         shown = [(name, text if len(text := _shown(value)) < 40 else name) for name, value in others]
         plain = {p.name for p in parameters if p.default is p.empty and p.name not in kwargs}

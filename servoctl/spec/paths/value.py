@@ -462,6 +462,23 @@ class PathAt(Path):
     def __reduce__(self):
         return PathAt, (*super().__reduce__()[1], self.source)
 
+    def __mul__(self, factor):
+        return self.source * factor
+
+    __rmul__ = __mul__
+
+    def __add__(self, other):
+        return self.source + other
+
+    __radd__ = __add__
+
+    def __sub__(self, other):
+        return self.source - other
+
+    def at_rate(self, factor, about=None):
+        """See `Path.at_rate`; the parameters stay."""
+        return self.source.at_rate(factor, about)
+
 
 def path_at(path, numbers):
     """A path with numbers of parameters by name: itself if it contains none."""
