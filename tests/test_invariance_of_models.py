@@ -306,7 +306,7 @@ def test_a_start_where_a_pivot_vanishes_gets_pivots_of_its_own(name, gallery_mod
     assert np.all(np.isfinite(list(reaction.values())))
 
 
-AFFIRMED = ("overhead-crane", "winch-crane", "appell-hamel", "mass-on-car", "vtol", "two-link-arm", "wheeled-robot")
+AFFIRMED = ("overhead-crane", "winch-crane", "appell-hamel", "mass-on-car", "vtol", "wheeled-robot")
 
 
 @pytest.mark.parametrize("name", AFFIRMED)

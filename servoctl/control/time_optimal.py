@@ -100,7 +100,8 @@ class Curve:
     def _by_time(self):
         """The paths by name with s = (t - t0)/(t1 - t0)."""
         (t0, t1), paths = self.span, self._paths.items()
-        return {name: replace(path, breaks=(path.breaks - t0) / (t1 - t0)) for name, path in paths}
+        whole = {name: _with_rests(path.held(), t0, t1) for name, path in paths}
+        return {name: replace(path, breaks=(path.breaks - t0) / (t1 - t0)) for name, path in whole.items()}
 
     def _by_arc_length(self):
         """The path of all references along the part of the length of their curve.
@@ -171,6 +172,20 @@ class Curve:
         factorials = np.array([float(factorial(j)) for j in range(k + 1)])
         path = fitted(jets, law.breaks, k, FITTED, "hold", "hold")
         return {name: path[i] for i, name in enumerate(self.pieces)}
+
+
+def _with_rests(path, t0, t1):
+    """The path of one component with pieces in which it is held from t0 on, and to t1 [s]."""
+    breaks, table, classes = path.breaks, path.coefficients, path.classes
+    rest = np.zeros((1, *table.shape[1:]))
+    if path.before == "hold" and t0 < breaks[0]:
+        rest[0, :, 0] = path(breaks[0])
+        breaks, classes, table = np.append(t0, breaks), np.append(np.inf, classes), np.concatenate([rest, table])
+    if path.after == "hold" and t1 > breaks[-1]:
+        last = rest * 0.0
+        last[0, :, 0] = path(breaks[-1])
+        breaks, classes, table = np.append(breaks, t1), np.append(classes, np.inf), np.concatenate([table, last])
+    return replace(path, breaks=breaks, coefficients=table, classes=classes)
 
 
 class Inverse:

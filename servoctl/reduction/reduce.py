@@ -259,7 +259,8 @@ def holds(reduction, values):
     left, sizes = points.evaluate(r.conditions)
     usual = replace(points, z=at_nominal_size(points.z, points.sizes(points.level), q.nq))
     sizes = np.maximum(sizes, usual.evaluate(r.conditions)[1])  # a velocity that the program keeps at zero is rounding
-    return bool(np.all(np.abs(left) <= HELD * np.maximum(sizes, TINY)))
+    largest = sizes.max(axis=1, keepdims=True)  # as is a length that vanishes at one of the points
+    return bool(np.all(np.abs(left) <= HELD * np.maximum(largest, TINY)))
 
 
 def strong(pivots, before):
