@@ -162,8 +162,7 @@ def test_loops_turn_unstable_where_the_bound_says_within_two_per_cent(rho, delay
     law = sv.computed(plan, plant, rate=rate, poles=10.0)
     (name,) = law.info["orders"]
     assert law.info["orders"][name] == rho
-    known = np.poly([-10.0] * rho)[:0:-1, None]  # the rows of the poles, before the jets of references
-    (first,) = (i for i in range(len(law.schedule) - rho + 1) if np.allclose(law.schedule[i : i + rho], known))
+    first = len(plant.parameters) + 1 + len(law.inputs)  # the rows of the poles, before the jets of references
     grows = []
     for share in (0.98, 1.02):
         pole = share * sampled_bound(rho, delay) * rate

@@ -654,7 +654,7 @@ def test_within_limits_a_path_is_cut_off_exactly(outside, sides):
 Q = sv.coordinates("x")
 OLD = {
     "rest_to_rest": (lambda: rest_to_rest(Q.t, 0.0, 5.0, duration=6.0), "sv.paths.rest_to_rest(0.0, 5.0, duration=6.0)"),
-    "of numbers": (lambda: rest_to_rest(0.5, 0.0, 5.0, 6.0, 4), "sv.paths.rest_to_rest(0.0, 5.0, 6.0, smoothness=4)"),
+    "by place": (lambda: rest_to_rest(Q.t, 0.0, 5.0, 6.0, 4), "sv.paths.rest_to_rest(0.0, 5.0, 6.0, smoothness=4)"),
     "spline": (lambda: spline(Q.t, [0, 1], [0, 2], ends="natural"), "sv.paths.spline([0, 1], [0, 2], ends='natural')"),
     "trapezoid": (lambda: trapezoid(t=Q.t, distance=1.0, duration=6.0, ramp=1.0), "distance=1.0, duration=6.0, ramp=1.0"),
 }  # fmt: skip

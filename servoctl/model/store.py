@@ -24,6 +24,7 @@ import numpy as np
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.errors import SpecificationError
 from servoctl.reduction.manifold import sizes_of_references
+from servoctl.reduction.reduce import references
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.packing import packed, unpacked
@@ -119,7 +120,9 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
     if (type(mechanism.q), type(mechanism.parameters)) != (Coordinates, Parameters):
         return None
     try:
-        t, state, sizes = (None, {}, {}) if near is None else near
+        t, state, spreads = (None, {}, {}) if near is None else near
+        numbers = np.asarray(mechanism.parameters.values() if values is None else values, dtype=float)
+        q, sizes = mechanism.q, sizes_of_references(mechanism.q, mechanism.parameters.symbols, numbers).tolist()
         facts = [
             list(program.residuals),
             program.by,
@@ -131,9 +134,9 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
             ),
             [(name, float(value)) for name, value in (guess or {}).items()],
             None if near is None else float(t),
-            *([(name, float(value)) for name, value in some.items()] for some in (state, sizes)),
-            (numbers := np.asarray(mechanism.parameters.values() if values is None else values, dtype=float)).tolist(),
-            sizes_of_references(mechanism.q, mechanism.parameters.symbols, numbers).tolist(),
+            *([(name, float(value)) for name, value in some.items()] for some in (state, spreads)),
+            numbers.tolist(),
+            [sizes[q.family.names.index(name)] for name in references(mechanism, program)],
         ]
         chosen = (*program.weights.values(), *program.toward.values())
         residuals = [*program.residuals.values(), *program.with_turns.values()]

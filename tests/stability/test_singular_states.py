@@ -132,12 +132,18 @@ def test_a_curvature_ends_where_the_speed_does(method):
 # the passive arm -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["RK45", "LSODA", "RK8"])
-@pytest.mark.parametrize("drift", [None, 0.1])
+PASSED_OVER = pytest.mark.xfail(strict=True, reason="a step of RK8 leads beyond the singular state, and stops later")
+
+
+@pytest.mark.parametrize(
+    ("drift", "method"),
+    [(d, m) for d in (None, 0.1) for m in ("RK45", "LSODA", "RK8") if (d, m) != (None, "RK8")]
+    + [pytest.param(None, "RK8", marks=PASSED_OVER)],
+)
 def test_the_passive_arm_stops_at_its_lost_relative_degree(method, drift):
     model = sv.derive(*passive_arm(0.5))
     options = {"step": 2e-3} if method == "RK8" else {}
-    with pytest.raises((sv.errors.SingularProgram, sv.errors.IntegrationStopped)) as caught:  # a step passes over it
+    with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, model.start(q2=0.0, dq2=0.0), (0.0, 2.0), method=as_method(method, **options), drift=drift)
     run = caught.value.run
     assert 30.0 < np.rad2deg(np.abs(run["q2"][-1])) < 48.1897 + 0.01
