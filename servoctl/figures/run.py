@@ -314,7 +314,7 @@ def extrema_text(run, name, units):
 
 
 def _instants(run, axes):
-    """Faint vertical lines at the knots of the path."""
+    """Faint vertical lines at the breaks of paths and at switches."""
     for ax in axes:
         for knot in run.knots:
             if min(run.t[0], run.t[-1]) <= knot <= max(run.t[0], run.t[-1]):

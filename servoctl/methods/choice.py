@@ -235,7 +235,7 @@ class RungeKutta(Method):
     order : {4, 8}
         The classical one of Kutta, or that of Prince and Dormand.
     step : float, optional
-        Step length [s]; default (t1 - t0)/2000. Steps are shortened to end at the knots of paths. A warning is
+        Step length [s]; default (t1 - t0)/2000. Steps are shortened to end at breaks of paths. A warning is
         issued where they do not resolve the motion.
     """
 
@@ -289,7 +289,7 @@ class RadauIIA(Method):
     order : {5, 9, 13}, optional
         Default: the order of least work for rtol.
     step : float, optional
-        Length of fixed steps [s], shortened to end at knots; default: steps follow from the tolerances.
+        Length of fixed steps [s], shortened to end at breaks of paths; default: steps follow from the tolerances.
     rtol, atol : float
         Tolerances of a step, and of the equations solved in it; default atol as for `Taylor`.
     """

@@ -101,7 +101,7 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
         return None, None, False
     x0, p, atol = cases
     n, n_x = x0.shape
-    p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects branches of paths
+    p = np.column_stack([p, np.full(n, sum(span) / 2)])  # the instant that selects pieces of paths
     arrays = {"x0": x0, "p": p, "atol": atol, "pivots": pivot_sizes(model), "times": times}
     arrays = {name: np.ascontiguousarray(array, dtype=float) for name, array in arrays.items()}
     arrays |= _results(n, len(times), n_x)

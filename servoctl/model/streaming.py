@@ -25,8 +25,6 @@ class Feedforward:
     ----------
     orders : dict of str to int
         Of each reference the number of derivatives that its jets have at least.
-    t : float
-        Time of the next sample [s].
     """
 
     def __init__(self, model, start, rate):

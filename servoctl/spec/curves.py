@@ -18,12 +18,12 @@ ORTHONORMAL = 1e-9  # largest difference of products of a circle's axes from tho
 
 
 def line(s, start, end):
-    """Go along a straight line, from `start` at s = 0 to `end` at s = 1; of the class of its time law `s`.
+    """Go along a straight line, from `start` at s = 0 to `end` at s = 1; of the class of `s`.
 
     Parameters
     ----------
     s : SX or float
-        Time law, dimensionless; the line goes on for s outside [0, 1].
+        A reference or a formula of time, dimensionless; the line goes on for s outside [0, 1].
     start, end : float, SX, or sequence (n,) of them
         The ends.
 
@@ -48,7 +48,7 @@ def circle(angle, centre, radius, axes=None):
     Parameters
     ----------
     angle : SX or float
-        Any expression of time [rad].
+        A reference or a formula of time [rad].
     centre : sequence (2,) or (3,) of float or SX
         The centre [m].
     radius : float or SX

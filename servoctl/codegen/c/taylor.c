@@ -83,7 +83,7 @@ typedef struct {
     const double *ends, *weights;
 } Steps;
 
-/* p, whose last number is the instant that selects the branches of paths. */
+/* p, whose last number is the instant that selects the pieces of paths. */
 static inline void on_branch(const double *p, double t, double *branch)
 {
     for (int64_t i = 0; i < NP - 1; i++) branch[i] = p[i];
