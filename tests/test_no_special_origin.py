@@ -156,7 +156,7 @@ REFUSED = {"crane-3d": "refused in millimetres: 'the order of a row changes', wh
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=REFUSED[n])) if n in REFUSED else n for n in SCENES]
+    "name", [pytest.param(n, marks=pytest.mark.xfail(reason=REFUSED[n])) if n in REFUSED else n for n in SCENES]
 )
 def test_scenes_need_the_same_forces_in_other_coordinates(name):
     scene = gallery[name]

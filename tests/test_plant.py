@@ -222,7 +222,7 @@ def test_a_plant_says_what_was_set():
         assert fact in text
 
 
-ONE_BIT = pytest.mark.xfail(strict=True, reason="at one of five points two rates differ by a bit; the cause is not known")
+ONE_BIT = pytest.mark.xfail(reason="at one of five points two rates differ by a bit; the cause is not known")
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_a_curvature_ends_where_the_speed_does(method):
 # the passive arm -----------------------------------------------------------------------------------------------------
 
 
-PASSED_OVER = pytest.mark.xfail(strict=True, reason="a step of RK8 leads beyond the singular state, and stops later")
+PASSED_OVER = pytest.mark.xfail(reason="a step of RK8 leads beyond the singular state, and stops later")
 
 
 @pytest.mark.parametrize(
