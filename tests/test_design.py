@@ -38,7 +38,11 @@ def through(times=(0.0, 0.8, 2.0), smoothness=2):
 
 @pytest.fixture(scope="module")
 def crane():
-    """Its load goes from (0, 4) through (via_x, via_z) in the middle of a time T to (5, 2) m."""
+    return crane_through()
+
+
+def crane_through():
+    """The crane's model and parameters: its load goes from (0, 4) through (via_x, via_z) in the middle of a time T to (5, 2) m."""
     p = sv.parameters(m_trolley=10.0, m_hoist=5.0, m_load=100.0, g=9.81, via_x=2.0, via_z=2.5, T=6.0)
     q = sv.coordinates("x l theta")
     x, l, theta = q

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from refusals import refused
-from test_design import crane_forces
+from test_design import crane_forces, crane_through
 from test_design import curve as spline
 
 import servoctl as sv
@@ -113,17 +113,7 @@ def test_what_is_refused(case):
 
 @pytest.fixture(scope="module")
 def crane():
-    """Its load goes through (via_x, via_z) in the middle of a time T."""
-    p = sv.parameters(m_trolley=10.0, m_hoist=5.0, m_load=100.0, g=9.81, via_x=2.0, via_z=2.5, T=6.0)
-    x, l, theta = q = sv.coordinates("x l theta")
-    load = ca.vertcat(x + l * ca.sin(theta), l * ca.cos(theta))
-    S = sv.particle(q, p.m_trolley, x) + sv.particle(q, p.m_hoist, l) + sv.particle(q, p.m_load, load)
-    potential = -p.m_load * p.g * load[1]
-    machine = sv.Mechanism(q, S, potential=potential, actuators={"trolley": x, "hoist": l}, parameters=p)
-    points = [[0.0, 4.0], [p.via_x, p.via_z], [5.0, 2.0]]
-    path = sv.paths.spline([0.0, 0.5, 1.0], points, smoothness=4).at_rate(1 / p.T)
-    r = q.references(X=path[0], Z=path[1])
-    return sv.derive(machine, sv.Program({"X": load[0] - r.X, "Z": load[1] - r.Z}))
+    return crane_through()[0]
 
 
 def moved(model, t_span=(0.0, 6.0), **settings):
@@ -157,6 +147,18 @@ def test_another_duration_is_followed_without_a_derivation(crane):
     assert fixed.paths["X"].breaks[-1] == 6.0 and fixed.paths["Z"].breaks[-1] == 5.0
     with refused(SpecificationError):
         crane.with_parameters(T=-1.0)
+
+
+def test_arithmetic_on_the_path_of_a_model_keeps_its_parameters(crane):
+    """Also components and reflected operations; what cannot keep them is refused."""
+    given, fixed = crane.paths["X"], sv.paths.rest_to_rest(0.0, 1.0, 2.0)
+    for made in (2 * given, given[0], -given, 1.0 - given, given - 1.0, given + 1.0, given.at_rate(2.0)):
+        assert made.names == given.source.names
+    other = crane.with_references(X=given[0] * 0.5).with_parameters(T=5.0)
+    assert other.paths["X"].breaks[-1] == 5.0 and other.paths["X"](5.0) == pytest.approx(2.5, rel=1e-14)
+    for refuse in (lambda: fixed - given, lambda: fixed + given, lambda: given.then(fixed)):
+        with refused(SpecificationError):
+            refuse()
 
 
 def test_a_run_is_saved_and_loaded_with_its_path(crane, tmp_path):

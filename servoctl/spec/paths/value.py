@@ -140,7 +140,7 @@ class Path(Value):
         result = taylor(self.coefficients, pieces, tau, order)
         ends = np.abs(tau) == 1.0
         if ends.any():  # where a path rests its derivatives are zero: rounding would determine directions
-            terms = taylor(np.abs(self.coefficients), pieces[ends], np.ones(ends.sum()), order)
+            terms = taylor(np.abs(self.coefficients[pieces[ends]]), np.arange(ends.sum()), np.ones(ends.sum()), order)
             rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
             result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
         result[1:, held] = 0.0
@@ -474,6 +474,16 @@ class PathAt(Path):
 
     def __sub__(self, other):
         return self.source - other
+
+    def __rsub__(self, other):
+        return other - self.source
+
+    def __getitem__(self, i):
+        return self.source[i]
+
+    def then(self, other):
+        """Refused, as of a path with parameters."""
+        return self.source.then(other)
 
     def at_rate(self, factor, about=None):
         """See `Path.at_rate`; the parameters stay."""
