@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from servoctl.checks import as_span, by_name, finite, interval, mapping, require_kind
+from servoctl.checks import as_span, finite, interval, mapping, require_kind
 from servoctl.control.extremes import excesses, extremes
 from servoctl.control.time_optimal import Curve, Inverse, Problem, smooth
 from servoctl.errors import (
@@ -27,7 +27,7 @@ from servoctl.simulation import judged, simulated
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.paths import rest_to_rest
 from servoctl.spec.program import Program
-from servoctl.spec.references import followed_path, orders_in, paths_at, required_paths
+from servoctl.spec.references import orders_in, other_paths, paths_at, required_paths
 from servoctl.values import frozen
 
 REACH = 12  # doublings of the time, after which a motion is nearly static, or halvings
@@ -231,8 +231,7 @@ def paths_of(mechanism, program, given, parameters):
     """The paths of a program's references by name, some of which may be given, with parameters by name."""
     q, known = mechanism.q, mechanism.parameters
     paths = {name: q.family.paths[name] for name in program.references(q)}
-    changes = by_name(mapping(given, "The paths"), paths, "reference", "The references")
-    paths = required_paths(paths | {name: followed_path(name, path) for name, path in changes.items()})
+    paths = required_paths(other_paths(paths, mapping(given, "The paths")))
     return paths_at(paths, known, known.values(parameters))
 
 
@@ -262,20 +261,19 @@ class _Scene:
             )
         return {name: path.at_rate(1 / factor, self.t_span[0]) for name, path in self.paths.items()}
 
-    def tried(self, slower, factor, paths=None):
+    def tried(self, program, factor, paths):
         """(largest excess, binding, program, plan) of a time law; the excess is infinite if there is no motion."""
         t0, t1 = self.t_span
         try:
-            model = derived(self.mechanism, slower, self.guess)
-            model = model.with_references(**paths) if paths else model
+            model = derived(self.mechanism, program, self.guess).with_references(**paths)
             model = model.with_parameters(**self.parameters) if self.parameters else model
             values = {name: value / factor ** _level(model, name) for name, value in self.start.items()}
             start = model.start(t0, guess=self.guess, **values)
             plan = simulated(model, start, (t0, t0 + (t1 - t0) * factor), progress=False)
         except (SingularProgram, InconsistentStart, IntegrationStopped):
-            return np.inf, ("", "", t0), slower, None
+            return np.inf, ("", "", t0), program, None
         excess, name, side, t, *_ = max(excesses(plan, self.limits))
-        return excess, (name, side, t), slower, plan
+        return excess, (name, side, t), program, plan
 
 
 def _bracket(attempt):

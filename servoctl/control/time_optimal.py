@@ -100,7 +100,7 @@ class Curve:
     def _by_time(self):
         """The paths by name with s = (t - t0)/(t1 - t0)."""
         (t0, t1), paths = self.span, self._paths.items()
-        whole = {name: _with_rests(path.held(), t0, t1) for name, path in paths}
+        whole = {name: _with_rests(path, t0, t1) for name, path in paths}
         return {name: replace(path, breaks=(path.breaks - t0) / (t1 - t0)) for name, path in whole.items()}
 
     def _by_arc_length(self):
@@ -177,14 +177,16 @@ class Curve:
 def _with_rests(path, t0, t1):
     """The path of one component with pieces in which it is held from t0 on, and to t1 [s]."""
     breaks, table, classes = path.breaks, path.coefficients, path.classes
-    rest = np.zeros((1, *table.shape[1:]))
+
+    def rest(t):
+        return np.pad([[[path(t)]]], ((0, 0), (0, 0), (0, table.shape[2] - 1)))
+
     if path.before == "hold" and t0 < breaks[0]:
-        rest[0, :, 0] = path(breaks[0])
-        breaks, classes, table = np.append(t0, breaks), np.append(np.inf, classes), np.concatenate([rest, table])
+        table = np.concatenate([rest(breaks[0]), table])
+        breaks, classes = np.append(t0, breaks), np.append(np.inf, classes)
     if path.after == "hold" and t1 > breaks[-1]:
-        last = rest * 0.0
-        last[0, :, 0] = path(breaks[-1])
-        breaks, classes, table = np.append(breaks, t1), np.append(classes, np.inf), np.concatenate([table, last])
+        table = np.concatenate([table, rest(breaks[-1])])
+        breaks, classes = np.append(breaks, t1), np.append(classes, np.inf)
     return replace(path, breaks=breaks, coefficients=table, classes=classes)
 
 

@@ -247,7 +247,7 @@ class Tape:
             return self._add(_BINARY[op], a[0], a[1])
         if op in _UNARY:
             return self._add(_UNARY[op], a[0])
-        if op == ca.OP_COPYSIGN and a[0] == a[1]:  # the sign of itself: by it conditions of branches stay in place
+        if op == ca.OP_COPYSIGN and a[0] == a[1]:  # the sign of itself, by which emitted series keep a condition apart
             return a[0]
         if op in _CONSTANT:
             return self._add("constant", *a[: 1 if op in (ca.OP_NOT, ca.OP_SIGN) else 2], data=_CONSTANT[op])

@@ -18,7 +18,6 @@ from servoctl.codegen.interpreted import weighted
 from servoctl.codegen.paths import BY_INSTANT
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
-from servoctl.jets.tape import Tape
 from servoctl.methods.choice import Project
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
@@ -27,6 +26,7 @@ from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
+from servoctl.reduction.cascade import Running
 from servoctl.reduction.ranks import clean, eliminate
 from servoctl.values import frozen
 
@@ -40,27 +40,14 @@ OF_PIECE = ca.SX.sym("t_of_piece")  # the instant that selects pieces of paths
 SMALLEST = 1e-12  # of a piece: shorter steps are not halved, so that a jump of the equations is passed
 
 
-class _Group:
-    """Rows of one order with their running series."""
+class _Group(Running):
+    """Rows of one order with their running series, which compute with numbers and parameters outside of them."""
 
     def __init__(self, motion, order, members, expressions):
-        self.motion, self.order, self.members = motion, order, members
-        self.symbols = ca.symvar(ca.vertcat(*expressions))
-        self.inputs = [[] for _ in self.symbols]
+        super().__init__(motion, order, expressions)
         constants = {i for i, symbol in enumerate(self.symbols) if motion.q.where(symbol) is None}
-        self.series = Series(constants_outside(Tape(self.symbols, expressions), constants), self.inputs)
-
-    def advance(self, k):
-        """Coefficient k - order of the rows, from the motion's coefficients up to k."""
-        for i, symbol in enumerate(self.symbols):
-            self.inputs[i].append(self.motion.coefficient(symbol, k - self.order))
-        self.series.advance()
-        return [c[-1] for c in self.series.outputs]
-
-    def correct(self, k):
-        """Repeat the last coefficient with the solution γ_[k]."""
-        j = k - self.order
-        self.series.replace_last({i: self.motion.coefficient(s, j) for i, s in enumerate(self.symbols)})
+        self.members = members
+        self.series = Series(constants_outside(self.series.tape, constants), self.series.inputs)
 
 
 class _Motion(Motion):
@@ -77,7 +64,7 @@ class _Motion(Motion):
 
     def _move(self, k):
         """q_[k] from q' = V w + h."""
-        self._place(k, self.gamma[k] if self.q.plain else self.kinematics.advance(k))
+        self._place(k, self.gamma[k] if self.q.plain else self.kinematics.advance())
 
     def _place(self, k, rates):
         """Set q_[k] from coefficient k - 1 of q', or γ_[k] itself."""
@@ -96,7 +83,7 @@ class _Motion(Motion):
         """Set γ_[k] to the solution, and q_[k] with it."""
         self.gamma[k], rates = gamma, gamma
         if not self.q.plain:
-            self.kinematics.correct(k)
+            self.kinematics.repeat()
             rates = [c[-1] for c in self.kinematics.series.outputs]
         self._place(k, rates)
 
@@ -141,11 +128,11 @@ class _Rows:
             groups, right = [group for group in groups if group.order <= k], {}
             for group in groups:
                 scale = -factorial(k - group.order) / factorial(k)
-                right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+                right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(), strict=True)}
             if len(rows):
                 self._settle(k, columns, self._solution(rows, columns, order, right))
                 for group in groups:
-                    group.correct(k)
+                    group.repeat()
 
     def _below(self, k):
         """The stages of index k < s̄."""
@@ -229,7 +216,7 @@ def _with_multipliers(equations, last):
         motion.mu[-1] = (mu * float(k * (k - 1))).elements()
         motion.settle(k, [0.0 if x.is_zero() else x for x in gamma.elements()])
         for group in (*groups, balance):
-            group.correct(k)
+            group.repeat()
     return motion
 
 
@@ -239,8 +226,8 @@ def _groups(motion, rows):
     for order in sorted({row.order for row in rows}):
         members = [a for a, row in enumerate(rows) if row.order == order]
         groups.append(_Group(motion, order, members, [rows[a].expression for a in members]))
-        for k in range(order, motion.top):
-            groups[-1].advance(k)
+        for _ in range(order, motion.top):
+            groups[-1].advance()
     return groups
 
 
@@ -249,7 +236,7 @@ def _right(groups, k):
     right = {}
     for group in groups:
         scale = -factorial(k - group.order) / factorial(k)
-        right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(k), strict=True)}
+        right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(), strict=True)}
     return ca.vertcat(*(right[a] for a in sorted(right)))
 
 

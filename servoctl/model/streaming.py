@@ -38,6 +38,7 @@ class Feedforward:
             )
         self._begin, self._state, self._period = start.t, start.values, 1.0 / positive("rate", rate)
         self._count, self._before = 0, None
+        self._names, self._forces = model.signals("reaction" if model.reduction.ideal else "actuation")
         self.orders = {name: max(order, 0) for name, order in model.reduction.follows.items()}
 
     @property
@@ -48,7 +49,7 @@ class Feedforward:
     def __repr__(self):
         jets = ", ".join(f"{name} to order {order}" for name, order in self.orders.items())
         kept = "" if self._model.flat else f"; keeps the state {', '.join(self._model.state_names)}"
-        return f"Feedforward of {', '.join(self._model.actuators)} from the jets of {jets}{kept}"
+        return f"Feedforward of {', '.join(self._names)} from the jets of {jets}{kept}"
 
     def __call__(self, jets):
         """The forces at the next sample.
@@ -72,8 +73,7 @@ class Feedforward:
         jets, t = self._checked(jets), self.t
         model = self._model.with_references(**{name: _beside(t, r) for name, r in jets.items()})
         state = self._solved(model, t) if model.flat else self._integrated(jets, t)
-        names, f = model.signals("reaction" if model.reduction.ideal else "actuation")
-        forces = f(t, with_highest(model, np.array([t]), state[:, None])[:, 0], model.p)
+        forces = self._forces(t, with_highest(model, np.array([t]), state[:, None])[:, 0], model.p)
         if not np.isfinite([*state, *forces]).all():
             raise IntegrationStopped(
                 f"The machine cannot follow the references at t = {t:g} s.",
@@ -82,7 +82,7 @@ class Feedforward:
                 t=t,
             )
         self._state, self._before, self._count = state, jets, self._count + 1
-        return dict(zip(names, forces.tolist(), strict=True))
+        return dict(zip(self._names, forces.tolist(), strict=True))
 
     def _solved(self, model, t):
         """The state of a flat program at t [s], by Newton's method from that of the last sample; NaN without one."""

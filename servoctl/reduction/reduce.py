@@ -192,8 +192,10 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
     plain, errors = guess is None if near else all(map(_ordinary, filter(None, (guess or {}).values()))), {}
     for scaled in (not plain,) if near else (not plain, plain):  # a guess far from the origin tells no size
-        sizes = sizes_of_references(mechanism.q, mechanism.parameters.symbols, values)
-        scales = usual(mechanism, program, guess or {}, values, _window, sizes) if scaled else None
+        scales = None
+        if scaled:
+            sizes = sizes_of_references(mechanism.q, mechanism.parameters.symbols, values)
+            scales = usual(mechanism, program, guess or {}, values, _window, sizes)
         if errors and scaled and scales.ordinary:
             break
         try:

@@ -28,12 +28,7 @@ BESIDE = 0.5  # relative distance of the points with which solutions are compare
 
 @frozen
 class Balance:
-    """The key of the balance r, or of one component of it, beside the names of residuals."""
-
-    component: str = ""  # name of a coordinate or quasi-velocity; empty for the whole balance
-
-    def __str__(self):
-        return f"the force on {self.component}" if self.component else "the balance"
+    """The key of the balance r, beside the names of residuals."""
 
 
 @frozen

@@ -194,9 +194,9 @@ class _Many:
         if not self.paths:
             return [self.model] * len(which)
         for i in which:
-            if i not in self.followers:
+            if i not in self.followers and i not in self.errors:
                 self.followers[i] = self.model._along(self.model.paths | self.paths_of(i))
-        return [self.followers[i] for i in which]
+        return [self.followers.get(i, self.model) for i in which]
 
     def numbers(self, which, p):
         """Parameters p (N, n_p) of some cases as functions have them: after the places of the paths."""
@@ -386,5 +386,4 @@ class _Many:
         places = {i: k for k, i in enumerate(which.tolist())} if self.runs else {}
         runs = {places[i]: run for i, run in self.runs.items() if i in places}
         states, p = self.samples[which].transpose(2, 1, 0), self.parameters[which].T
-        models = [self.model if i in self.errors else self.along([i])[0] for i in which.tolist()]
-        return Signals(models, self.model, t, count, states, p, level, runs)
+        return Signals(self.along(which.tolist()), self.model, t, count, states, p, level, runs)

@@ -76,9 +76,13 @@ class ParametricPath(Value):
     def _function(self):
         return ca.Function.deserialize(self.content)
 
+    @property
+    def _symbols(self):
+        return ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(name) for name in self.names))
+
     def _forms(self):
         """A, b, t0 and T as expressions of symbols with the names of the parameters."""
-        return self._function(ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(name) for name in self.names)))
+        return self._function(self._symbols)
 
     def made(self, numbers):
         """The path with numbers of the parameters by name, among others."""
@@ -90,7 +94,7 @@ class ParametricPath(Value):
 
     @cached_property
     def _slopes(self):
-        p = ca.vertcat(*(ca.SX.sym(name) for name in self.names))
+        p = self._symbols
         return ca.Function("slopes", [p], [ca.densify(ca.jacobian(part, p)) for part in self._function(p)])
 
     def _by(self, numbers, names):
@@ -122,10 +126,10 @@ class ParametricPath(Value):
             result.append(path._with(coefficients=table, classes=classes))
         return result
 
-    def _require_known_outside(self, path, moves):
+    def _require_known_outside(self, path, broken):
         """Refuse a path whose derivative is not held, or does not repeat, outside its breaks where these move."""
-        bent = path.breaks[[0, -1]][moves[[0, -1]] & (path.classes[[0, -1]] < 1)]
-        if len(bent) or path.before == "periodic" and moves.any():
+        bent = path.breaks[[0, -1]][broken[[0, -1]] & (path.classes[[0, -1]] < 1)]
+        if len(bent) or path.before == "periodic" and broken.any():
             what = f"has a bend where it is held, at t = {bent[0]:g} s" if len(bent) else "is periodic"
             raise SpecificationError(
                 f"The path {what}, and its breaks move with {', '.join(self.names)}.",
