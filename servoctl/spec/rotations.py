@@ -97,6 +97,8 @@ def vectors(rotations):
     """
     rotations = array_of("rotations", rotations, None, 3, 3)
     rotations = [_matrix_of_numbers(rotation, f"rotations[{i}]") for i, rotation in enumerate(rotations)]
+    if not rotations:  # an array of the shape (0, 3, 3)
+        raise SpecificationError("No rotation is given.", "A path passes through two at least.")
     middle, found = rotations[len(rotations) // 2], []
     for i, rotation in enumerate(rotations):
         axis, angle = _axis_and_angle(middle.T @ rotation, f"rotations[{i}] and the middle one")
