@@ -6,22 +6,24 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from servoctl import archive
-from servoctl.checks import antiderivative, finite, named, require_kind, rows_read, whole
+from servoctl.checks import antiderivative, as_numbers, finite, named, require_kind, rows_read, whole
+from servoctl.dense import between, extremes, jets_at, piece_of
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
 from servoctl.model.equations import residual_names, signal_groups
+from servoctl.model.following import ends_of_pieces
 from servoctl.model.jets import extended, jet_names_to
-from servoctl.model.model import Model
+from servoctl.model.model import Model, including
 from servoctl.model.start import State, without_rounding
 from servoctl.model.switching import switching
 from servoctl.model.variants import place_of, variant_at
+from servoctl.reduction.idle import names_of
 from servoctl.units import unit_of
 from servoctl.values import Value, frozen, read_only, same
 
-STENCIL = 9  # samples of the polynomial through which an extremum is refined: error of order h^9
-AS_SAMPLED = 1e-14  # relative: a refined extremum must exceed the sampled one by this
 SAME_TIME = 1e-12  # relative: rounding of an instant
 AGREES = 1e-6  # relative: difference of a signal in a file from that of a model, below which the run is of this model
 FACTS = {
@@ -153,6 +155,9 @@ class Run(Sampled, Value):
     events : dict of str to Run
         The motion at the instants of each event: `run.events["slack"].t` are its times [s],
         `run.events["slack"]["theta"]` the values of a signal there.
+    steps : tuple of Dense
+        The steps of the method, with which `at` and `extrema` know the motion between samples; none of a run that was
+        loaded or closed.
     start : State or None
         From which the motion was computed. It also says which branch of its solutions a flat program follows:
         `simulate(model, run.start, ...)` repeats it.
@@ -176,6 +181,7 @@ class Run(Sampled, Value):
     start: State | None = None
     events: dict = field(default_factory=dict)
     stored_units: dict = field(default_factory=dict, compare=False, repr=False)
+    steps: tuple = field(default=(), compare=False, repr=False)
 
     def __post_init__(self):
         for name in ("t", "jets"):
@@ -302,35 +308,99 @@ class Run(Sampled, Value):
         return {name: at.t for name, at in self.events.items()}
 
     def state(self, t: float) -> np.ndarray:
-        """The state (q, γ') of the mechanism at an instant, between samples by Hermite interpolation.
+        """The state (q, γ') of the mechanism at an instant; see `at`.
 
         Parameters
         ----------
-        t : float
+        t : float or (N,) array
             Within the run [s].
 
         Returns
         -------
-        (nq + n,) array
+        (nq + n,) or (nq + n, N) array
         """
         return self.at(t)[: self.model.nq + self.model.n]
 
-    def at(self, t: float) -> np.ndarray:
-        """The jets Z at an instant (n_z,), between samples by Hermite interpolation of all derivatives.
+    def at(self, t: ArrayLike) -> np.ndarray:
+        """The jets Z at any instants of the run, by the dense output of its steps.
+
+        A run that was loaded, or closed, has no steps: its jets come from Hermite's polynomials through all
+        derivatives at the samples beside an instant.
 
         Parameters
         ----------
-        t : float
+        t : float or (N,) array
             Within the run [s].
+
+        Returns
+        -------
+        (n_z,) or (n_z, N) array
 
         Raises
         ------
         SpecificationError
-            If t lies outside the run.
+            If an instant lies outside the run, or the run was loaded without its model.
         """
-        t = finite("t", t, "time")
+        times = self._within(t)
+        forward = 1.0 if self.t[-1] >= self.t[0] else -1.0
+        k = np.minimum(np.searchsorted(forward * self.t, forward * times), len(self.t) - 1)
+        jets, inside = self.jets[:, k], self.t[k] != times
+        if inside.any():
+            jets[:, inside] = jets_at(self._pieces, times[inside])[: len(jets)]
+        return jets if np.ndim(t) else jets[:, 0]
+
+    def sampled(self, t: ArrayLike) -> "Run":
+        """The run at other instants, as `at` gives it.
+
+        Parameters
+        ----------
+        t : (N,) array
+            Within the run [s], in its order.
+
+        Returns
+        -------
+        Run
+
+        Raises
+        ------
+        SpecificationError
+            As by `at`.
+        """
+        jets, times = self.at(np.atleast_1d(t)), self._within(t)
+        ranges = [(int(np.argmax(inside)), int(inside.sum()), model) for model, inside in self.by_model(times)]
+        variants = tuple((first, first + count, model) for first, count, model in ranges) if self.variants else ()
+        return replace(self, t=times, jets=jets, variants=variants, stored={}, stored_residual={})
+
+    def by_model(self, t: np.ndarray) -> list[tuple[Model, np.ndarray]]:
+        """The models that hold at instants, with their choices of pivots and sides of switches.
+
+        Parameters
+        ----------
+        t : (N,) array
+            Within the run [s].
+
+        Returns
+        -------
+        list of (Model, (N,) array of bool)
+            Each with the instants at which it holds.
+        """
+        if not len(self._pieces):
+            return [(self.model, np.ones(len(t), dtype=bool))]
+        which = piece_of(self._pieces, t)
+        return [(self._pieces[i].model, which == i) for i in np.unique(which)]
+
+    @cached_property
+    def _pieces(self):
+        """The steps of the run, or what passes through its samples."""
+        return self.steps or between(self)
+
+    def _within(self, t):
+        """Instants (N,) of the run, without what rounding lets them exceed it."""
+        times = np.atleast_1d(finite("t", t, "time") if np.ndim(t) == 0 else as_numbers(t))
         low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
-        if not low - SAME_TIME * (1 + abs(low)) <= t <= high + SAME_TIME * (1 + abs(high)):
+        outside = ~((low - SAME_TIME * (1 + abs(low)) <= times) & (times <= high + SAME_TIME * (1 + abs(high))))
+        if outside.any():
+            t = float(times[np.argmax(outside)])
             raise SpecificationError(
                 f"t = {t:g} s lies outside the run.",
                 f"It covers {low:g} to {high:g} s.",
@@ -339,48 +409,10 @@ class Run(Sampled, Value):
                 span=(low, high),
             )
         self.require_model()
-        i = int(np.argmin(np.abs(self.t - t)))
-        if abs(self.t[i] - t) < 1e-13 * max(1.0, high - low) or len(self.t) == 1:
-            return self.jets[:, i].copy()
-        step = 1 if (t > self.t[i]) == (self.t[-1] > self.t[0]) else -1
-        j = min(max(i + step, 0), len(self.t) - 1)
-        return self._hermite(t, *sorted((i, j), key=lambda k: self.t[k]))
-
-    def _hermite(self, t, i, j):
-        from scipy.interpolate import BPoly
-
-        model, ends, jets = self.model, [self.t[i], self.t[j]], self._ends(i, j)
-        nq, n = model.nq, model.n
-        top = (len(jets) - nq) // n
-        levels = [jets[nq + k * n : nq + (k + 1) * n] for k in range(top)]
-        plain = "coordinate_rates" not in signal_groups(model.reduction).values()
-        rates = levels if plain else self._coordinate_rates([i, j])
-        q = BPoly.from_derivatives(ends, np.stack([jets[:nq], *rates], axis=1).transpose(2, 1, 0))
-        if plain:
-            return np.concatenate([q(t, nu=k) for k in range(top + 1)])
-        w = BPoly.from_derivatives(ends, np.stack(levels, axis=1).transpose(2, 1, 0))
-        return np.concatenate([q(t), *(w(t, nu=k) for k in range(top))])
-
-    def _ends(self, i, j):
-        """Jets at two neighbouring samples, with the accelerations of the variant that holds between them.
-
-        Accelerations may jump where another variant begins.
-        """
-        jets, first, last = self.jets[:, [i, j]], min(i, j), max(i, j)
-        variant = self.variant(last)
-        if variant is not self.variant(first) and not variant.flat:
-            n_x, n, column = len(variant.state_names), variant.n, int(i > j)
-            rates = variant.function("ode")(self.t[first], jets[:n_x, column], variant.p)
-            jets[n_x : n_x + n, column] = rates[n_x - n : n_x]
-        return jets
-
-    def _coordinate_rates(self, columns):
-        _, f = self.model.signals("coordinate_rates")
-        values = f.grid(self.t[columns], self.jets[: f.n_x, columns], self.model.p)
-        return [values[: self.model.nq], values[self.model.nq :]]
+        return np.clip(times, low, high)
 
     def extrema(self, name: str) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The least and the greatest value of a signal, refined between samples.
+        """The least and the greatest value of a signal, between samples, too.
 
         Parameters
         ----------
@@ -392,35 +424,19 @@ class Run(Sampled, Value):
             Minimum and maximum of the finite values; NaN if there are none.
         """
         values = self[name]
-        return tuple(self._refined(values, sign) for sign in (-1.0, 1.0))
-
-    def _refined(self, values, sign):
-        known = np.isfinite(values)
-        k = int(np.argmax(np.where(known, sign * values, -np.inf)))
-        best = (float(self.t[k]), float(values[k]))
+        if self.model is None or len(self.t) < 2:
+            known = np.flatnonzero(np.isfinite(values))
+            ends = (known[np.argmin(values[known])], known[np.argmax(values[known])]) if len(known) else ()
+            return tuple((float(self.t[k]), float(values[k])) for k in ends) or ((float(self.t[0]), np.nan),) * 2
+        forward = 1 if self.t[-1] >= self.t[0] else -1
         low, high = sorted((self.t[0], self.t[-1]))
-        # no polynomial crosses a knot, where derivatives jump
-        edges = [low, *(knot for knot in sorted(self.knots) if low < knot < high), high]
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
-            if not a <= self.t[k] <= b:
-                continue
-            inside = np.flatnonzero((self.t >= a) & (self.t <= b))
-            if len(inside) < 4:
-                continue
-            first = min(max(k - STENCIL // 2, inside[0]), max(inside[0], inside[-1] - STENCIL + 1))
-            window = slice(first, min(first + STENCIL, inside[-1] + 1))
-            if not known[window].all():
-                continue
-            centre, width = self.t[k], np.ptp(self.t[window]) / 2
-            s = (self.t[window] - centre) / width
-            polynomial, _ = np.polynomial.Polynomial.fit(s, values[window], len(s) - 1, domain=[-1, 1], full=True)
-            neighbours = [(self.t[i] - centre) / width for i in (k - 1, k + 1) if i in inside]
-            for root in polynomial.deriv().roots():
-                if abs(root.imag) < 1e-9 and min([*neighbours, 0.0]) <= root.real <= max([*neighbours, 0.0]):
-                    value = float(polynomial(root.real))
-                    if sign * (value - best[1]) > AS_SAMPLED * np.abs(values[window]).max():
-                        best = (float(centre + root.real * width), value)
-        return best
+        ends = [piece.t for piece in self._pieces] or [self.t]
+        cuts = np.unique(
+            np.clip(np.concatenate([*ends, self.knots, ends_of_pieces(self.model, (low, high))]), low, high)
+        )
+        group = self._groups.get(name)
+        size = np.nanmax(np.abs(values if group is None else self.signals(group)[1]), initial=0.0)
+        return extremes(lambda t: self.sampled(t[::forward])[name][::forward], cuts, self.t, values, size)
 
     def save(self, path):
         """Save the run as npz, without pickle: samples, all signals, residuals, and what happened.
@@ -501,7 +517,9 @@ class Run(Sampled, Value):
         if self.start is not None and self.model is not None and self.model.flat:
             q = (f"{name} = {self.start[name]:.4g}" for name in self.model.reduction.mechanism.q.names)
             yield f"branch of {', '.join(q)} at t = {self.start.t:g} s"
-        yield ", ".join(f"{name} {count}" for name, count in self.counters.items() if count)
+        counted = [f"{name} {count}" for name, count in self.counters.items() if count]
+        longest = [np.abs(np.diff(piece.t)).max() for piece in self.steps]
+        yield ", ".join(counted + ([f"longest step {max(longest):.3g} s"] if longest else []))
         yield f"largest residuals over all levels: {', '.join(residuals)}" * bool(residuals)
 
 
@@ -586,6 +604,7 @@ def _event_at(arrays, i, own):
 def of_model(run, facts, model):
     """A loaded run with its model, which must give the signals of the file."""
     require_kind(Model, "model", model, "sv.derive(mechanism, program)")
+    model = including(model, names_of(run))
     numbers, names = facts.get("parameters"), jet_names_to(model, len(run.jets))
     off = {name: (value, model.numbers.get(name)) for name, value in (numbers or {}).items()}
     off = {name: pair for name, pair in off.items() if pair[0] != pair[1]}

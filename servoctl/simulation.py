@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import as_numbers, as_span
+from servoctl.checks import as_numbers, as_span, within
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, warn
 from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, no_growth_by_series
 from servoctl.methods.accuracy import (
@@ -61,6 +61,7 @@ from servoctl.run import SAME_TIME, Run
 
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
+MOST_ENDS = 10**6  # of steps that `max_step` asks for: more would fill the memory
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
 FEW_STEPS = 100  # of a motion, up to which its series tell about growth sooner than a bound does
 BESIDE_ROUND = 1e-3  # of an interval: own samples keep off round numbers, where formulas may be 0/0
@@ -76,6 +77,7 @@ def simulate(
     inputs: Mapping[str, object] | None = None,
     drift: Project | Poles | str | float | None = None,
     accuracy: float | None = None,
+    max_step: float | None = None,
     t_eval: ArrayLike | None = None,
     events: Mapping[str, object] | Sequence[object] | Event | Callable[..., float] | str | None = None,
     progress: bool | Callable[[float], object] | None = None,
@@ -109,6 +111,9 @@ def simulate(
     inputs : dict of str to float, Path, SX or callable, optional
         Of a plant, by actuator, default 0: numbers, paths, expressions of `q.t` and of references, or functions that
         give these of `q.t`. They act at once, within the plant's limits of magnitude.
+    max_step : float, optional
+        The longest step that a method may take [s]. A path is never stepped over, as steps end where its pieces do; a
+        formula of `q.t` or of the state that acts for less than a thousandth of the span may be.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span, or within the window of `Bounded`. Default: 1001 instants and the
         knots; all steps of `RungeKutta`.
@@ -138,11 +143,11 @@ def simulate(
     """
     model, start = _model_and_start(model, start, inputs)
     span = as_span(t_span)
-    events = as_events(events)
+    others = {"events": as_events(events), "progress": progress, "max_step": max_step}
 
     def motion(times):
         def attempt(method, drift):
-            return simulated(model, start, span, method, drift=drift, t_eval=times, events=events, progress=progress)
+            return simulated(model, start, span, method, t_eval=times, drift=drift, **others)
 
         return attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
 
@@ -208,7 +213,7 @@ def _sampled(run, times):
         return run
     verdict = partial(run.verdict, run) if callable(run.verdict) else run.verdict
     if run.method in ORDERS:
-        return replace(_resample(run, times), verdict=verdict)
+        return replace(_resampled(run, times), verdict=verdict)
     picked = np.isin(run.t, times)
     picked[-1] |= run.status != 0 or not picked.any()
     index = np.append(0, np.cumsum(picked))
@@ -216,7 +221,7 @@ def _sampled(run, times):
     return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants, verdict=verdict)
 
 
-def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, events=None, progress=None):
+def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t_eval=None, events=None, progress=None):
     """The run of `simulate`, without a verdict on its internal dynamics."""
     span = t0, t1 = as_span(t_span)
     method, drift = _method_and_drift(model, method, drift, t0, t1)
@@ -225,7 +230,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     smoother = SMOOTHER if isinstance(method, Algebraic) else method.order if isinstance(method, RungeKutta) else np.inf
     knots = breaks_within(model, span, smoother)
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
-    bar, problem = Progress(span, progress), (t0, x0, t1, times, knots, events)
+    bar, problem = Progress(span, progress), (t0, x0, t1, times, _ends_of_steps(knots, span, max_step), events)
     try:
         motion = _tolerant(model, method, drift, problem, bar)
     except Unsuited as unsuited:
@@ -240,7 +245,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
         end_where_orders_change(motion)
         started = _as_started(model, start, t0, x0 if motion.start is None else motion.start)
         run = _run(model, motion, (method, drift, knots), started, t1)
-        return _resample(run, times) if t_eval is not None and isinstance(method, RungeKutta) else run
+        return _resampled(run, times) if t_eval is not None and isinstance(method, RungeKutta) else run
 
     run = _kept(finished)
     if motion.stop is not None:
@@ -249,6 +254,15 @@ def simulated(model, start, t_span, method=None, *, drift=None, t_eval=None, eve
     if run.success and not model.flat and not motion.drifted <= DRIFTED:
         _warn_drifted(run)
     return run
+
+
+def _ends_of_steps(knots, span, max_step):
+    """The knots, with as many further instants as steps need to be no longer than `max_step` [s]; None for any."""
+    if max_step is None:
+        return knots
+    length = abs(span[1] - span[0])
+    count = np.ceil(length / within("max_step", max_step, least=length / MOST_ENDS, above=0.0))
+    return tuple(np.union1d(knots, np.linspace(*span, int(count) + 1)[1:-1]).tolist())
 
 
 def _kept(finished):
@@ -365,11 +379,11 @@ def _motion(model, method, drift, problem, bar, atol=None):
     `atol` (n_x,) replaces the default of the method.
     """
     t0, x0, t1, times, knots, events = problem
-    watched = None if times is None or not events else Events(events, model, times)
+    watched = None if times is None or not events else Events(events, model, t0, t1)
     if isinstance(method, Algebraic):
         return _with_events(algebraic(model, (t0, t1), x0, times, knots, bar, watched), watched)
     if isinstance(method, Bounded):
-        watched = Events(events, model, np.zeros(0)) if events else None
+        watched = Events(events, model, t0, t1) if events else None
         return _with_events(bounded(model, (t0, t1), x0, method, (times, knots), bar, watched), watched)
     family = switching(model)
     if family is not None:
@@ -443,6 +457,7 @@ def _run(model, motion, settings, start, t1):
         _set_at_knots(t, jets, facts["variants"], knots)
     facts["events"] = occurrences(motion.occurrences, partial(jet_names_to, model))
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
+    facts["steps"] = tuple(motion.steps)
     return Run(t, jets, jet_names_to(model, len(jets)), model, start=start, **facts)
 
 
@@ -461,24 +476,11 @@ def _set_at_knots(t, jets, variants, knots):
                 jets[:, at] = extended(model, t[at], jets[:top, at], len(jets))
 
 
-def _resample(run, times):
-    """The run at other times: states between steps by interpolation, and their highest derivatives by the equations."""
-    direction = np.sign(run.t[-1] - run.t[0]) or 1.0
+def _resampled(run, times):
+    """The run at those of other times that it reaches, and in any case at the event that ends it."""
     low, high = min(run.t[0], run.t[-1]), max(run.t[0], run.t[-1])
     times = times[(times >= low) & (times <= high)]
-    if run.status == 1 and run.t[-1] not in times:  # at the event that ends it
-        times = np.append(times, run.t[-1])
-    steps = np.searchsorted(direction * run.t, direction * times - SAME_TIME * (1 + abs(high - low)))
-    jets = np.array([run.at(t) for t in times]).T.reshape(len(run.jets), len(times))
-    variants = []
-    for first, end, variant in run.variants or ((0, len(run.t), run.model),):
-        inside = np.flatnonzero((steps >= first) & (steps < end))  # the variant of a step's end holds within the step
-        if len(inside):
-            a, b, n_x = int(inside[0]), int(inside[-1]) + 1, len(variant.state_names)
-            rates, highest = with_highest(variant, times[a:b], jets[:n_x, a:b])[n_x:], jets[n_x : n_x + variant.n, a:b]
-            highest[:] = np.where(np.isfinite(highest), rates, highest)
-            variants.append((a, b, variant))
-    return replace(run, t=times, jets=jets, variants=tuple(variants))
+    return run.sampled(np.append(times, run.t[-1]) if run.status == 1 and run.t[-1] not in times else times)
 
 
 def _require_decay(model, drift, t0, t1):

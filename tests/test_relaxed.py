@@ -12,7 +12,6 @@ from test_bounded import flexible_link
 
 import servoctl as sv
 from servoctl.control.nonlinear import IPOPT, LONGEST
-from servoctl.control.reference import resampled
 from servoctl.errors import InconsistentStart, IntegrationStopped, LimitExceeded, NameUnknown, SpecificationError
 from servoctl.gallery import overhead_crane
 from servoctl.inversion.relaxed import DEFECT, FACTOR, FIRST, Relaxation
@@ -170,7 +169,7 @@ def test_bounds_hold_at_their_instants(crane, coarse, bounds, values):
     run = sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, bounds=bounds)
     edges = np.array([0.0, *run.knots, 6.0])
     instants = (edges[:-1, None] + np.diff(edges)[:, None] * np.arange(WATCHED) / WATCHED).ravel()
-    there, plant = resampled(run, instants), crane[0]
+    there, plant = run.sampled(instants), crane[0]
     u = run.model.paths["cart_path"]
     states = there.jets[:4]  # interpolated accelerations have errors where inputs have corners
     rates = [plant.rates(t, x, [u(t)]) for t, x in zip(instants, states.T, strict=True)]
@@ -224,7 +223,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing(plan):
     absolute = sv.Mechanism(q, gibbs=S, potential=981.0 * Z, actuators={"cart": x}, constraints={"rope": rope})
     program = sv.Program({"X": X - q.references(X=rest_to_rest(0.0, 5.0, 6.0)).X})
     run = sv.relaxed(sv.plant(absolute), program, (0.0, 6.0), weight=1e-8, start={"Z": -4.0})
-    assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
+    assert run.sampled(plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
     assert (run["X"] - run["x"]) ** 2 + run["Z"] ** 2 == pytest.approx(16.0, abs=1e-8)
     assert sv.verify(run).passed
 
@@ -235,7 +234,7 @@ def test_material_constraints_and_quasi_velocities_change_nothing(plan):
     other = sv.Mechanism(q, gibbs=S, potential=981.0 * load[1], actuators={"cart": x})
     program = sv.Program({"X": load[0] - q.references(X=rest_to_rest(0.0, 5.0, 6.0)).X})
     run = sv.relaxed(sv.plant(other), program, (0.0, 6.0), weight=1e-8)
-    assert resampled(run, plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
+    assert run.sampled(plan.t)["cart"] == pytest.approx(plan["cart"], abs=1e-3)
     assert sv.verify(run).passed
 
 

@@ -27,14 +27,14 @@ FAMILIES = ("errors", "methods", "types")  # modules of public classes
 
 LAYERS = (
     "version", "errors", "values", "markup", "tolerances", "checks", "units", "archive", "progress", "jets", "spec", "robots", "programs", "reduction", "codegen",
-    "model", "plants", "run", "methods", "growth", "simulation", "figures", "control", "verification",
+    "model", "dense", "plants", "run", "methods", "growth", "simulation", "figures", "control", "verification",
     "sensitivities", "study", "inversion", "interop", "export", "gallery", "shell",
 )  # fmt: skip
 WITHOUT_CASADI = ("study", "figures", "interop", "shell")
 SWEEPS = ("concurrent.futures", "multiprocessing", "importlib.metadata")
 LATE = ("scipy", "matplotlib", "control", "tqdm", "xarray", "pandas", "dask")
 MOST_IN_A_FUNCTION, MOST_PARAMETERS, MOST_MODULES_OF_A_NAME, MOST_IN_A_REPR = 40, 8, 2, 8
-SHEETS = ("Mechanism.__init__", "simulate", "simulate_many")  # filled in by keyword
+SHEETS = ("Mechanism.__init__", "simulate", "simulated", "simulate_many")  # filled in by keyword
 
 
 def relative(path):

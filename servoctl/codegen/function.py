@@ -240,12 +240,12 @@ class Compiled:
         `start` has t0, the state there and the ends of `taylor`; `times` (N,) are samples in the order of the motion.
         In `net`, at (M,) parts of each step and at a distance of instants [s], series are compared with the equations,
         not at the end if that is a knot (its third entry); `judged` has (rtol, atol) of the states, which judge
-        "invariants". Returns the number of steps; the jets q, γ', ..., γ^(s̄) at the samples, by "settled" if there is
-        one; and facts: how far γ^(s̄) of the series is from that of "rates" (n,), the longest step (1,), the largest
-        sizes of the states (n_x,) and, after the start, of "invariants" relative to their tolerances there (m,), the
-        least size of each pivot, 0 where its sign changes, and the largest one, and (1,) the largest of the
-        "invariants" at the end, relative to its gradient times the state. None if the steps do not reach the end,
-        samples are not finite, or nothing is compiled.
+        "invariants". Returns rows of the steps, as `taylor` does; the jets q, γ', ..., γ^(s̄) at the samples, by
+        "settled" if there is one; and facts: how far γ^(s̄) of the series is from that of "rates" (n,), the longest
+        step (1,), the largest sizes of the states (n_x,) and, after the start, of "invariants" relative to their
+        tolerances there (m,), the least size of each pivot, 0 where its sign changes, and the largest one, and (1,) the
+        largest of the "invariants" at the end, relative to its gradient times the state. None if the steps do not reach
+        the end, samples are not finite, or nothing is compiled.
         """
         self._require_loop("taylor")
         self._place(self._library, start[0], start[1], p)

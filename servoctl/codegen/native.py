@@ -69,7 +69,7 @@ class Library:
         return run
 
     def whole(self, ends, tolerances, most, times, net, sizes):
-        """The number of steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
+        """Rows of the steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
         task, (inside, distance, to_knot, *judged), count = self.workspace.steps, net, len(times)
         task.of(ends, *tolerances, 0.0, most, None)
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
@@ -77,7 +77,7 @@ class Library:
         samples = np.array([count, len(inside), to_knot, 0, 0, 0, *places])
         samples.view(float)[3:6] = distance, *judged
         steps = self._whole(task.pointer, argument(samples))
-        return (steps, jets, facts) if steps >= 0 else None
+        return (task.log[: steps + 1].copy(), jets, facts) if steps >= 0 else None
 
     @functools.cached_property
     def _whole(self):

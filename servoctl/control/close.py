@@ -11,7 +11,7 @@ from servoctl.checks import as_numbers, as_span, require_memory, whole_multiple
 from servoctl.control.conditions import Conditions, Sensors, Timing, index, limits, require_few_steps, steps
 from servoctl.control.law import Law, UserStep
 from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, Loop, run_loop
-from servoctl.control.reference import Reference, of_plan, require_plan, require_plant, resampled
+from servoctl.control.reference import Reference, of_plan, require_plan, require_plant
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
 from servoctl.plants.plant import Plant
@@ -112,8 +112,7 @@ def loop_of(plant, law, x0, t_span, conditions):
     low, high, change = limits(plant, law.period)
     initial = np.clip(_initial_input(law, t0), low, high)
     x0 = _initial_state(plant, t0, x0, initial)
-    if plant.constrained and not np.isfinite(plant.rates(t0, x0, initial)).all():
-        plant = plant.near(t0, x0)
+    plant = plant.sound_at(t0, x0, plant.p(initial))
     substeps, transport = steps(plant, law.period, timing.substeps, t0, x0, initial)
     require_few_steps(samples, substeps, plant.function("ode").operations)
     loop = Loop(
@@ -149,7 +148,7 @@ def _initial_input(law, t0):
     plan = law.plan
     if plan is None or getattr(plan, "model", None) is None or not plan.t[0] < t0:
         return law.initial_input
-    at_start = resampled(plan, np.array([min(t0, plan.t[-1])]))
+    at_start = plan.sampled(np.array([min(t0, plan.t[-1])]))
     return np.array([at_start[name][0] for name in law.inputs])
 
 

@@ -92,7 +92,7 @@ def _points(plan, plant):
 def _plant_states(plan, plant, times):
     """States of a plant (N, n_x) along a plan."""
     lagging = [np.interp(times, plan.t, plan[name]) for name in plant.lagged]
-    return np.column_stack([np.array([plan.state(t) for t in times]), *lagging])
+    return np.column_stack([plan.state(times).T, *lagging])
 
 
 def _without_units(matrices):

@@ -1,15 +1,10 @@
 """The reference of a law: a plan at the sampling instants, with the plant's linearisation about it."""
 
-from dataclasses import replace
-from math import factorial, perm
-
 import numpy as np
 
 from servoctl.checks import ON_SAMPLE, named, positive, require_kind, require_memory
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
 from servoctl.plants.plant import Plant, part_of
-
-DISTINCT = 1e-6  # of the mean distance of samples: between nearer ones polynomials are rounding
 
 
 class Reference:
@@ -48,7 +43,7 @@ class Reference:
         t = np.minimum(t, self.end)
         key = t.tobytes()
         if key not in self._runs:
-            self._runs[key] = resampled(self.plan, t)
+            self._runs[key] = self.plan.sampled(t)
         return self._runs[key]
 
     def planned(self, name):
@@ -92,12 +87,7 @@ class Reference:
     def linearised(self):
         """A (N, n_x, n_x) and B (N, n_x, m) of the plant in the middle of each sample."""
         A, B = self.plant.linearised(self.middle, self.middle_x, self.middle_input)
-        lost = _lost(A, B)
-        if lost.any() and self.plant.constrained:
-            k = int(np.argmax(lost))
-            other = self.plant.near(float(self.middle[k]), self.middle_x[:, k])
-            A[lost], B[lost] = other.linearised(self.middle[lost], self.middle_x[:, lost], self.middle_input[:, lost])
-            lost = _lost(A, B)
+        lost = ~(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(B).all(axis=(1, 2)))
         if lost.any():
             raise ServoError(
                 f"The plant's linearisation is not finite at t = {self.middle[lost][0]:.6g} s of the plan.",
@@ -106,11 +96,6 @@ class Reference:
                 t=float(self.middle[lost][0]),
             )
         return A, B
-
-
-def _lost(A, B):
-    """Samples at which a linearisation is not finite, (N,)."""
-    return ~(np.isfinite(A).all(axis=(1, 2)) & np.isfinite(B).all(axis=(1, 2)))
 
 
 def require_plant(plant):
@@ -169,47 +154,3 @@ def require_plan(plan, plant):
     ):
         for name in names:
             named(name, valid, what)
-
-
-def resampled(plan, times):
-    """The plan at other instants within it, (N,) [s], increasing, by Hermite interpolation of all derivatives."""
-    apart = DISTINCT * (plan.t[-1] - plan.t[0]) / len(plan.t)
-    model, distinct = plan.model, np.append(np.diff(plan.t) > apart, True)
-    t, z = plan.t[distinct], plan.jets[:, distinct]
-    nq, n = model.nq, model.n
-    top = (len(z) - nq) // n
-    i = np.clip(np.searchsorted(t, times, side="right") - 1, 0, len(t) - 2)
-    place = (i, t[i + 1] - t[i], times)
-    levels = [z[nq + k * n : nq + (k + 1) * n] for k in range(top)]
-    if model.reduction.mechanism.q.plain:
-        jets = _hermite(t, [z[:nq], *levels], *place)
-    else:
-        rates = plan.signals("coordinate_rates")[1][:, distinct]
-        jets = [*_hermite(t, [z[:nq], rates[:nq], rates[nq:]], *place)[:1], *_hermite(t, levels, *place)]
-    edges = [0, *(np.searchsorted(times, plan.t[first]) for first, _, _ in plan.variants[1:]), len(times)]
-    variants = tuple((a, b, v[2]) for a, b, v in zip(edges[:-1], edges[1:], plan.variants, strict=False) if b > a)
-    return replace(plan, t=times, jets=np.vstack(jets), variants=variants, stored={}, stored_residual={})
-
-
-def _hermite(t, derivatives, i, h, times):
-    """Values and derivatives at times (M,) of the polynomials that match all derivatives at the ends of intervals.
-
-    `derivatives` are (n, N) arrays of the orders 0, 1, ..., r at t (N,); `i` and `h` the interval of each instant and
-    its length. Returns as many (n, M) arrays.
-    """
-    r, s = len(derivatives), (times - t[i]) / h
-    low = [d[:, i] * (h**k / factorial(k)) for k, d in enumerate(derivatives)]
-    matrix = np.array([[perm(j, k) for j in range(r, 2 * r)] for k in range(r)], dtype=float)
-    ends = [d[:, i + 1] * h**k for k, d in enumerate(derivatives)]
-    missing = [end - sum(perm(j, k) * low[j] for j in range(k, r)) for k, end in enumerate(ends)]
-    c = [*low, *np.tensordot(np.linalg.inv(matrix), missing, 1)]
-    return [_derivative(c, k, s) / h**k for k in range(r)]
-
-
-def _derivative(c, k, s):
-    """The k-th derivative of Σ c_j s^j, by Horner's rule."""
-    value = np.zeros(c[0].shape)
-    for j in reversed(range(k, len(c))):
-        value *= s
-        value += perm(j, k) * c[j]
-    return value

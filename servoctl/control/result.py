@@ -11,7 +11,6 @@ from servoctl.checks import ON_SAMPLE
 from servoctl.control.conditions import Conditions
 from servoctl.control.law import Law, UserStep, sample_at
 from servoctl.control.loop import Loop, samples_ago
-from servoctl.control.reference import resampled
 from servoctl.control.residuals import known_residuals
 from servoctl.errors import SpecificationError
 from servoctl.markup import fitted, listed
@@ -200,7 +199,7 @@ class Closed(Sampled, Value):
         """States minus those of the plan (after its end, minus its last ones), by name; empty without a plan."""
         if self.plan is None:
             return {}
-        plan = resampled(self.plan, np.clip(self.t, self.plan.t[0], self.plan.t[-1]))
+        plan = self.plan.sampled(np.clip(self.t, self.plan.t[0], self.plan.t[-1]))
         return {name: self[name] - plan[name] for name in self.plant.state_names if name in plan.names}
 
     def planned(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -218,7 +217,7 @@ class Closed(Sampled, Value):
         if self.plan is None:
             return np.zeros(0), np.zeros(0)
         t = self.t[self.t <= self.plan.t[-1]]
-        return t, resampled(self.plan, t)[name]
+        return t, self.plan.sampled(t)[name]
 
     def state(self, t: float) -> np.ndarray:
         """The state of the plant at a sample, (n_x,).

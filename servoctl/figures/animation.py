@@ -361,7 +361,7 @@ def _postures(run, t):
     if hasattr(run, "commands") or len(run.t) >= PATH_POINTS:  # straight between samples: that cannot be seen
         q = np.array([np.interp(t, *_ascending(run, name)) for name in mechanism.q.names])
     else:
-        q = np.array([run.at(instant)[: mechanism.q.nq] for instant in t]).T
+        q = run.at(t)[: mechanism.q.nq]
     return mechanism, q, np.asarray(p)[: len(mechanism.parameters.names)], paths
 
 

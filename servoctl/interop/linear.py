@@ -7,7 +7,6 @@ import numpy as np
 from servoctl.checks import array_of, as_list, as_numbers, finite, named, positive, require_kind, without_effect
 from servoctl.codegen.jacobians import differentiable, jacobian
 from servoctl.control.law import Law, ordered
-from servoctl.control.reference import resampled
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.errors import SpecificationError
@@ -112,7 +111,7 @@ def along(thing, run, times=None, **options):
         values |= {f"input {name}": value[picked] for name, value in run.input.items()}
     else:
         _require_within(run, times)
-        values = resampled(run, times)
+        values = run.sampled(times)
         if isinstance(thing, Plant) and run.model is not None:
             thing = part_of(thing, run.model.reduction.mechanism)
     for k, t in enumerate(times):
@@ -251,7 +250,7 @@ def _linear_law(law, t, x, controller_state, name):
             raise SpecificationError(
                 f"The law {law.name!r} has no plan.", "A law is linearised about x.", do="Pass x.", name=law.name
             )
-        at = resampled(law.plan, np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
+        at = law.plan.sampled(np.clip([float(t)], law.plan.t[0], law.plan.t[-1]))
         x = {measure: at[measure][0] for measure in law.measures}
     y, m, n_z = ordered(x, law.measures, "measurement", exactly=False), len(law.inputs), len(law.state)
     z = array_of("controller_state", law.state if controller_state is None else controller_state, n_z)

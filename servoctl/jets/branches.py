@@ -70,8 +70,11 @@ class Branches:
         self.taken = taken
         self.moves, self.switches, self._angles, self._functions = moves, [], {}, []
 
-    def smooth(self, expressions, angles=False):
-        """SX scalars with branches as parameters; atan2 stays as it is, or is a continuous angle if `angles`."""
+    def smooth(self, expressions, angles=""):
+        """SX scalars with branches as parameters.
+
+        `angles` by atan2 are "continuous" ones, or "principal" ones, which jump; without it they stay as they are.
+        """
         if not expressions:
             return []
         merged = ca.densify(ca.cse(ca.vertcat(*expressions)))
@@ -82,12 +85,12 @@ class Branches:
         def value(op, operands):
             original.append(apply_code(op, *(original[i] for i in operands)))
             moves.append(any(moves[i] for i in operands))
-            decides = op in _SIDES or (angles and op == ca.OP_ATAN2)
+            decides = op in _SIDES or (angles != "" and op == ca.OP_ATAN2)
             decides &= not any(_ends_an_exponent(original[i]) for i in operands)
             if not (moves[-1] and decides):
                 return apply_code(op, *(work[i] for i in operands))
             pairs = [(work[i], original[i]) for i in operands]
-            return self._angle(*pairs) if op == ca.OP_ATAN2 else self._side(op, *pairs)
+            return self._angle(*pairs, angles) if op == ca.OP_ATAN2 else self._side(op, *pairs)
 
         def leaf(expression, symbol):
             original.append(expression)
@@ -104,15 +107,18 @@ class Branches:
             return _SIDES[op](1 - self._branch(y - x, y0 - x0, rests), x, y)
         return _SIDES[op](self._branch(x - y, x0 - y0, rests), x, y)
 
-    def _angle(self, y, x):
-        """The continuous angle of (x, y)."""
+    def _angle(self, y, x, kind):
+        """The continuous angle of (x, y), or the principal one, which turns back by 2π behind the origin."""
         (y, y0), (x, x0) = y, x
-        key = y.element_hash(), x.element_hash()
+        key = y.element_hash(), x.element_hash(), kind
         if key not in self._angles:
             b = self._parameter()
             sign = ca.cos(ca.pi * b)
             ahead = sign * x + _NARROW * ca.sqrt(x**2 + y**2)
             turned = b + ca.if_else(sign * y >= 0, 1, -1)
+            if kind == "principal":
+                back = ca.logic_and(b != 0, b * y < ahead)
+                ahead, turned = ca.if_else(back, b * y, ahead), ca.if_else(back, -b, turned)
             self.switches.append(Switch(b, ahead, turned, f"the angle of ({_words(x0)}, {_words(y0)})", angle=True))
             self._angles[key] = b, sign
         b, sign = self._angles[key]

@@ -12,6 +12,7 @@ from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.watch import Watch
 from servoctl.model.pivots import pivot_sizes
 from servoctl.model.switching import switching
+from servoctl.values import frozen
 
 STEPS = 50  # at least, in a span: shorter movements between two rests are overlooked where there are no samples
 NODES = 1000  # steps per call of the loop: 0.3 ms compiled, 50 ms where CasADi evaluates
@@ -54,8 +55,7 @@ class _Algebraic(Stepping):
 
     def _jets(self, z):
         """Jets (q, γ', γ'') from q and further outputs of `Equations.path`."""
-        first, _, end = self.ends
-        return z[:end] if first == self.model.nq else np.concatenate([z[: self.model.nq], z[first:end]])
+        return _jets_of(self.model, z)
 
     def _pivots_of(self, outputs):
         return self._levels(outputs)[2]
@@ -93,6 +93,7 @@ class _Algebraic(Stepping):
         if z.shape[1] < len(times):
             return False
         self.motion.fill(self.model, times, self._jets(z))
+        self.motion.keep(self.model, nodes[:, 0], _Between(self.model, self.f, nodes))
         self.motion.start = np.concatenate([nodes[0, 1 : 1 + nq], self._levels(outputs[:, 0])[0]])
         self.motion.count(iterations=followed + solved, steps=len(nodes) - 1)
         self.progress(cuts[-1])
@@ -179,17 +180,11 @@ class _Algebraic(Stepping):
 
     def _meets_event(self, nodes, end, stops):
         """Whether a terminal event ends the motion between nodes; the samples up to it are then recorded."""
-
-        def solved(t):
-            return self._jets(self.f.newton(t, nodes, self.p)[0])
-
-        t = self.events.instants(np.append(nodes[:-1, 0], end))[1]
-        jets = solved(t)
-        t = t[: jets.shape[1]]
-        found = self.events.first(self.model, t, jets, lambda s: solved(np.array([s]))[:, 0], stops)
+        t, dense = np.append(nodes[:-1, 0], end), _Between(self.model, self.f, nodes)
+        found = self.events.first(self.model, t, lambda s: dense(None, s, self.p), stops)
         if found is not None:
             x, top = np.split(found.jets[:, None], [len(self.model.state_names)])
-            self.pending = self.pending[self.direction * self.pending < self.direction * min(found.t, t[-1])]
+            self.pending = self.pending[self.direction * self.pending < self.direction * found.t]
             self._sample(nodes, x[:, 0], end, end)
             self.motion.add(self.model, [found.t], x, top)
             self.motion.ended = found.name
@@ -197,6 +192,8 @@ class _Algebraic(Stepping):
 
     def _sample(self, nodes, x, t, t1):
         """Solve at the pending instants up to t, where the state is x; at all of them if the motion ends there."""
+        if len(nodes) > 1:
+            self.motion.keep(self.model, nodes[:, 0], _Between(self.model, self.f, nodes), (), t)
         count = len(self.pending) if t == t1 else int(np.sum((self.pending - t) * self.direction <= 0))
         now, self.pending = self.pending[:count], self.pending[count:]
         for first in range(0, count, BLOCK):
@@ -211,8 +208,39 @@ class _Algebraic(Stepping):
                 self.progress(block[-1])
 
 
+def _jets_of(model, z):
+    """Jets (q, γ', γ'') from q and further outputs of `Equations.path` (n_y, N)."""
+    nq, n = model.nq, model.n
+    if model.reduction.mechanism.q.plain:
+        return z[: nq + 2 * n]
+    return np.concatenate([z[:nq], z[3 * nq : 3 * nq + 2 * n]])
+
+
+@frozen(eq=False)
+class _Between:
+    """Jets between nodes, which `Equations.path` f solves for."""
+
+    model: object
+    f: object
+    nodes: np.ndarray
+
+    @property
+    def nbytes(self):
+        """Memory of the nodes."""
+        return self.nodes.nbytes
+
+    def __call__(self, k, t, p):
+        """Jets (n_z, N) at instants (N,), whatever the steps; NaN where there is no solution."""
+        order = np.argsort(np.sign(self.nodes[-1, 0] - self.nodes[0, 0]) * t)
+        z, _ = self.f.newton(t[order], self.nodes, p)
+        solved = _jets_of(self.model, z)
+        jets = np.full((len(solved), len(t)), np.nan)
+        jets[:, order[: solved.shape[1]]] = solved
+        return jets
+
+
 def switched(reduction):
     """Whether a row of the motion has a kink or a switch that the motion may cross."""
     branches = Branches(reduction.mechanism.q.moves)
-    branches.smooth([row.expression for row in reduction.rows], angles=True)
+    branches.smooth([row.expression for row in reduction.rows], angles="continuous")
     return bool(branches.switches)

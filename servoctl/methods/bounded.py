@@ -92,6 +92,7 @@ def bounded(model, span, guess, method, instants, progress, events=None):
     outputs = model.function("ode").grid(times, samples, model.p)
     problem.require_pivots(times, outputs[problem.n_x :])
     motion.add(model, times, samples, outputs[problem.n_x - model.n : problem.n_x])
+    motion.keep(model, mesh, _Between(problem, mesh, x))
     motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s{left_out}; "
     motion.note += f"a window of twice the length changes the motion by {truncation:.1e}"
     return motion
@@ -124,11 +125,28 @@ def _to_event(problem, events, solution, times):
     model = problem.model
 
     def jets(t):
-        return with_highest(model, t, problem.at(t, *solution), problem.p)
+        return with_highest(model, t, problem.at(t, *solution))
 
-    t = events.instants(np.union1d(times, solution[0]))[1]
-    found = events.first(model, t, jets(t), lambda s: jets(np.array([s]))[:, 0])
+    found = events.first(model, solution[0], jets)
     return (times, "") if found is None else (np.append(times[times < found.t], found.t), found.name)
+
+
+@frozen(eq=False)
+class _Between:
+    """Jets of the solution x of a problem on a mesh."""
+
+    problem: object
+    mesh: np.ndarray
+    x: np.ndarray
+
+    @property
+    def nbytes(self):
+        """Memory of the solution."""
+        return self.x.nbytes
+
+    def __call__(self, k, t, p):
+        """Jets (n_z, N) at instants t (N,)."""
+        return with_highest(self.problem.model, t, self.problem.at(t, self.mesh, self.x), p)
 
 
 @frozen
@@ -229,7 +247,7 @@ class FreeEntries:
     """
 
     def __init__(self, model, t, guess):
-        self.model, self.p = model, model.p
+        self.model = model
         self._equations = model.once("bounded", lambda: _equations(model))
         self.n_x, self.m = len(model.state_names), len(invariant_names(model))
         self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *corners_of(model))
@@ -255,7 +273,7 @@ class FreeEntries:
     def _evaluated(self, t, x):
         """X' (N, n_x), ∂X'/∂X (N, n_x, n_x), the invariants (N, m), their Jacobian (N, m, n_x) at states (n_x, N)."""
         n, m = self.n_x, self.m
-        y = self._equations.grid(t, x, self.p).T
+        y = self._equations.grid(t, x, self.model.p).T
         f, J, g, G = np.split(y, np.cumsum([n, n * n, m]), axis=1)
         return f, J.reshape(len(t), n, n).swapaxes(1, 2), g, G.reshape(len(t), n, m).swapaxes(1, 2)
 

@@ -10,11 +10,12 @@ from contextlib import suppress
 
 import numpy as np
 
+from servoctl.dense import steps_of
 from servoctl.errors import IntegrationStopped
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import RESOLUTION, End, net, steps_of
+from servoctl.methods.watch import RESOLUTION, End, net
 from servoctl.values import frozen
 
 OFF = 1e3  # times the tolerance, which the equations may add to a step
@@ -157,9 +158,16 @@ class BulkSteps(Stepping):
         worst = wrong[k[wrong] == good]
         return int(good), float(at[worst[np.argmax(excess[worst])]])
 
+    def _use(self, model):
+        super()._use(model)
+        self.projection = model.function("ode_projected") if self.projects else None
+
     def _record(self, steps, first, last, end=None):
-        """Record the pending samples from the start of step `first` to the start of step `last`, or an end within."""
+        """Keep the steps from `first` to before `last`, or to an end within it, and record the samples in them."""
         direction = 1.0 if self.forward else -1.0
+        dense = _Between(steps, self.f, self.model.n, self.projection)
+        ends, until = steps.t[first : last + 1 + (end is not None)], None if end is None else end.t
+        self.motion.keep(self.model, ends, dense, self.coefficients, until, first)
         due = direction * self.pending <= direction * (steps.t[last] if end is None else end.t)
         times, self.pending = self.pending[due], self.pending[~due]
         if not len(times):
@@ -167,13 +175,37 @@ class BulkSteps(Stepping):
         step = first + np.searchsorted(direction * steps.t[first : last + 1], direction * times, "right") - 1
         states = steps.x[:, np.clip(step, 0, last)]
         inside = (step < last + (end is not None)) & (times != steps.t[np.clip(step, 0, last)])
-        states[:, inside] = self._settled(times[inside], steps.at(step[inside], times[inside]))
-        top = self.f.grid(times, states, self.p)[self.n_x - self.model.n : self.n_x]
-        self.motion.add(self.model, times, states, top)
+        states[:, inside] = dense.states(step[inside], times[inside], self.p)
+        self.motion.add(self.model, times, dense.with_top(times, states, self.p))
 
-    def _settled(self, times, states):
-        """States of samples, projected if the method projects."""
-        return states
+
+@frozen(eq=False)
+class _Between:
+    """Jets within steps, with γ^(s̄), n values of the function f of X'; `projection` restores states, unless None."""
+
+    steps: Steps
+    f: object
+    n: int
+    projection: object
+
+    @property
+    def nbytes(self):
+        """Memory of the steps."""
+        return self.steps.nbytes
+
+    def states(self, k, t, p):
+        """X (n_x, N) at instants t (N,) within steps k (N,)."""
+        states = self.steps.at(k, t)
+        return states if self.projection is None else self.projection.restore_grid(t, states, p)
+
+    def with_top(self, t, states, p):
+        """Jets (n_z, N) of states."""
+        n_x = len(states)
+        return np.concatenate([states, self.f.grid(t, states, p)[n_x - self.n : n_x]])
+
+    def __call__(self, k, t, p):
+        """Jets (n_z, N) at instants t (N,) within steps k (N,)."""
+        return self.with_top(t, self.states(k, t, p), p)
 
 
 def differentiated(dense, t, k, times):

@@ -1,19 +1,16 @@
 """Events: instants at which a signal of a motion crosses a value, located within the steps of its method."""
 
 from collections.abc import Callable, Mapping
-from itertools import pairwise
 
 import numpy as np
 
 from servoctl.checks import as_list, finite, mapping, whole
+from servoctl.dense import one_sign_apart, parted
 from servoctl.errors import SpecificationError
-from servoctl.methods.watch import BESIDE_ENDS
 from servoctl.model.jets import jet_names_to
 from servoctl.run import Run
 from servoctl.values import frozen
 
-PARTS = 8  # of a step, at whose ends signals are evaluated, beside the samples within it
-TURNS = 0.2  # of a signal's values beside its least one: where a parabola comes below, its minimum is searched for
 AT_START = 1e-9  # of a signal in the first step: a start below it lies on the event, which is none
 AT_STOP = 1e-6  # of the motion's duration: an event this close beyond the instant where a motion must stop ends it
 
@@ -124,52 +121,44 @@ class Occurrence:
 class Events:
     """The events, by name, of a motion while it is being computed, and their occurrences `found` so far.
 
-    Its samples are at times (N,), in the order of the motion [s].
+    The motion goes from t0 to t1 [s].
     """
 
-    def __init__(self, events, model, times):
-        self.events, self.found, self.signs, self.start = events, [], None, None
-        self.forward = -1.0 if len(times) > 1 and times[-1] < times[0] else 1.0
-        self.times, self.began = times, (None, None, 0)
+    def __init__(self, events, model, t0, t1):
+        self.events, self.found, self.signs, self.start = events, [], None, t0
+        self.forward, self.length = (-1.0 if t1 < t0 else 1.0), abs(t1 - t0)
+        self.began = None, None, 0
         for event in events.values():
             _require_signal(event, model)
 
-    def instants(self, stretch, parts=PARTS):
-        """Indices of steps (N,) and instants (N,) at which signals are evaluated: ends, parts and samples of steps."""
-        inside = np.array([BESIDE_ENDS, *(np.arange(1, parts) / parts), 1 - BESIDE_ENDS]) if parts > 1 else np.zeros(0)
-        steps, instants = [[0]], [stretch[:1]]
-        for k, (a, b) in enumerate(pairwise(stretch)):
-            low, high = np.searchsorted(self.forward * self.times, self.forward * np.array([a, b]), "right")
-            samples = self.times[low:high] if parts > 1 else []
-            t = np.unique(np.concatenate([a + (b - a) * inside, samples, [b]]))[:: int(self.forward)]
-            steps.append(np.full(len(t), k))
-            instants.append(t)
-        return np.concatenate(steps), np.concatenate(instants)
+    def first(self, model, ends, jets_at, stops=False):
+        """The first terminal event along steps with these ends (S + 1,), or None; others before it are recorded.
 
-    def first(self, model, t, jets, at, stops=False):
-        """The first terminal event along instants t (N,) with jets (n_z, N), or None; others before it are recorded.
-
-        Instants are in the order of the motion, from the end of the last ones on [s]; `at` gives jets (n_z,) at one of
-        them. With `stops` the motion cannot go on from the last: an event may be what makes it singular there.
+        Ends are in the order of the motion, from that of the last steps on [s]; `jets_at` gives jets (n_z, N) at
+        instants (N,) in this order. With `stops` the motion cannot go on from the last: an event may be what makes it
+        singular there.
         """
-        self.start = t[0] if self.start is None else self.start
-        if self.began[0] == t[0]:  # these steps are repeated
+        if self.began[0] == ends[0]:  # these steps are repeated
             self.signs, self.found = self.began[1], self.found[: self.began[2]]
-        values = {name: self._along(event, model, t, jets) for name, event in self.events.items()}
-        if self.signs is None:
-            self.signs = dict.fromkeys(values, 0.0)
-        if t[0] == self.start:
-            values = {name: _with_start(g) for name, g in values.items()}
-        self.began = t[0], self.signs, len(self.found)
-        self.signs, crossed = dict(self.signs), []
-        for name, g in values.items():
-            crossings = list(self._crossings(name, t, g, lambda s, name=name: self._value(name, model, s, at)))
-            crossings += self._at_stop(t, g) if stops and not crossings else []
-            wanted = self.events[name].direction
-            crossed += [(self.forward * s, name) for s, sign in crossings if wanted in (0.0, sign)]
+        self.signs = dict.fromkeys(self.events, 0.0) if self.signs is None else dict(self.signs)
+        self.began, crossed = (ends[0], dict(self.signs), len(self.found)), []
+        for name, event in self.events.items():
+
+            def value(s, event=event):  # of the elapsed time
+                t = self.start + self.forward * s
+                return self._along(event, model, t, jets_at(t))
+
+            elapsed = self.forward * (ends - self.start)
+            s = one_sign_apart(value, parted(elapsed, self.length)) if len(ends) > 1 else elapsed
+            g = value(s)
+            s, g = s[np.isfinite(g)], g[np.isfinite(g)]
+            g = _with_start(g) if s[:1] == 0 else g
+            crossings = list(self._crossings(name, s, g, lambda at, value=value: float(value(np.array([at]))[0])))
+            crossings += self._at_stop(s, g) if stops and not crossings else []
+            crossed += [(at, name) for at, sign in crossings if event.direction in (0.0, sign)]
         for s, name in sorted(crossed):
-            jets_there = at(self.forward * min(s, self.forward * t[-1]))
-            self.found.append(Occurrence(name, float(self.forward * s), jets_there, model))
+            t, last = self.start + self.forward * s, self.start + self.forward * min(s, elapsed[-1])
+            self.found.append(Occurrence(name, float(t), jets_at(np.array([last]))[:, 0], model))
             terminal = self.events[name].terminal
             if terminal and sum(one.name == name for one in self.found) >= terminal:
                 return self.found[-1]
@@ -183,62 +172,29 @@ class Events:
     def _along(self, event, model, t, jets):
         return event.along(Run(t, jets, jet_names_to(model, len(jets)), model))
 
-    def _value(self, name, model, s, at):
-        return float(self._along(self.events[name], model, np.array([s]), at(s)[:, None])[0])
-
-    def _crossings(self, name, t, g, value):
-        """Instants at which values g (N,) at t (N,) change their sign, with the new one, and where they touch zero."""
-        sign, last = self.signs[name], None  # the last sign, and the instant at which it was seen
-        turns = _turns(t, g)
-        for j, new in enumerate(np.sign(np.nan_to_num(g))):
+    def _crossings(self, name, s, g, value):
+        """Elapsed times at which values g (N,) at s (N,) change their sign, with the new one."""
+        sign, last = self.signs[name], None  # the last sign, and when it was seen
+        for at, new in zip(s, np.sign(g), strict=True):
             if sign * new < 0:
-                yield (t[0] if last is None else _root(value, last, t[j])), new
-            if new and j in turns and sign * new > 0:
-                least = _least(lambda s, new=new: new * value(s), t[j - 1], t[j + 1])
-                if least is not None:
-                    yield _root(value, t[j - 1], least), -new
-                    yield _root(value, least, t[j + 1]), new
+                yield (s[0] if last is None else _root(value, last, at)), new
             if new:
-                sign, last = new, t[j]
+                sign, last = new, at
         self.signs[name] = sign
 
-    def _at_stop(self, t, g):
-        """Where values g (N,) at t (N,) vanish right beyond the last instant, extrapolated, with the new sign."""
-        elapsed = abs(t[-1] - self.start)
-        k = int(np.searchsorted(self.forward * t, self.forward * t[-1] - AT_START * elapsed)) - 1
+    def _at_stop(self, s, g):
+        """Where values g (N,) at s (N,) vanish right beyond the last instant, extrapolated, with the new sign."""
+        k = int(np.searchsorted(s, s[-1] * (1 - AT_START))) - 1 if len(s) else -1
         if k < 0 or not g[k] * g[-1] > 0 or not abs(g[-1]) < abs(g[k]):
             return []
-        s = t[-1] + g[-1] / (g[k] - g[-1]) * (t[-1] - t[k])
-        return [(s, -np.sign(g[-1]))] if abs(s - t[-1]) <= AT_STOP * elapsed else []
+        at = s[-1] + g[-1] / (g[k] - g[-1]) * (s[-1] - s[k])
+        return [(at, -np.sign(g[-1]))] if abs(at - s[-1]) <= AT_STOP * s[-1] else []
 
 
 def _with_start(g):
     """Values g (N,) from the start of a motion on, the first of them 0 where it is the rounding of zero."""
     size = np.abs(g[np.isfinite(g)]).max(initial=0.0)
     return np.append(0.0 if np.abs(g[0]) <= AT_START * size else g[0], g[1:])
-
-
-def _turns(t, g):
-    """Indices of values g (N,) of one sign at t (N,) whose least ones may lie beyond zero between the instants."""
-    if len(t) < 3:
-        return set()
-    size = np.abs(g)
-    before, here, after = size[:-2], size[1:-1], size[2:]
-    with np.errstate(all="ignore"):
-        left, right = (here - before) / (t[1:-1] - t[:-2]), (after - here) / (t[2:] - t[1:-1])
-        bend = (right - left) / (t[2:] - t[:-2])
-        vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
-    same = (np.sign(g[:-2]) == np.sign(g[1:-1])) & (np.sign(g[1:-1]) == np.sign(g[2:]))
-    low = same & (here <= before) & (here <= after) & (bend > 0) & (vertex < TURNS * np.minimum(before, after))
-    return {int(j) + 1 for j in np.flatnonzero(low)}
-
-
-def _least(value, a, b):
-    """Where a positive signal is below zero between a and b; None where it is not."""
-    from scipy.optimize import minimize_scalar
-
-    found = minimize_scalar(value, bounds=sorted((a, b)), method="bounded", options={"xatol": 1e-9 * abs(b - a)})
-    return float(found.x) if found.fun < 0 else None
 
 
 def _root(value, a, b):
@@ -248,7 +204,7 @@ def _root(value, a, b):
     low, high = value(a), value(b)
     if not low * high < 0:
         return a if abs(low) < abs(high) else b
-    return float(brentq(value, a, b, xtol=1e-15, rtol=8.9e-16))
+    return float(brentq(value, a, b, xtol=1e-15, rtol=8.9e-16, disp=False))  # a multiple root is as near as it gets
 
 
 def _require_signal(event, model):

@@ -8,17 +8,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from servoctl.dense import Dense, steps_of
 from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.methods.choice import Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
 from servoctl.reduction.orders import other_order
-from servoctl.values import frozen
 
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
+MOST_KEPT = 200e6  # bytes of steps: beyond them a motion is known at its samples alone
 MOST_RESERVED = 2_000_000  # samples: for more of them arrays grow, by doubling
 ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
@@ -44,6 +45,8 @@ class Motion:
     room: int = 0  # samples of the whole motion
     drifted: float = np.nan  # largest residual at t1, relative to its gradient times the state; NaN if it is not known
     largest: float | np.ndarray = 0.0  # magnitudes (n_x,) of X at the ends of steps
+    steps: list = field(default_factory=list)  # `Dense`, kept until they fill the memory that they may take
+    kept: float = 0.0  # memory of the steps; infinite where it was too much
     _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _jets: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
@@ -82,6 +85,19 @@ class Motion:
     def fill(self, model, t, jets):
         """Set all samples t (N,) and jets (n_z, N), computed with one variant of the model."""
         self.pieces, self._t, self._jets = [(model, 0, 0, len(t))], np.array(t), jets
+
+    def keep(self, model, t, jets, further=(), end=None, first=0):
+        """Keep steps with ends t (S + 1,), or up to an end within the last one [s]; see `Dense`."""
+        if end is not None and end != t[-1]:
+            forward = 1.0 if t[-1] >= t[0] else -1.0
+            t = np.append(t[forward * t < forward * end], end)
+        if len(t) < 2 or t[0] == t[-1] or self.kept == np.inf:
+            return
+        self.steps.append(Dense(model, t, jets, further, first))
+        self.kept += self.steps[-1].nbytes
+        if self.kept > MOST_KEPT:
+            self.steps, self.kept = [], np.inf
+            self.note = f"interpolated between samples, as its steps take more than {MOST_KEPT / 1e6:g} MB"
 
     def _reserve(self, room, rows):
         """Make room for samples; the system gives memory as they fill it."""
@@ -199,30 +215,6 @@ def equal_steps(a, b, step):
     return (b - a) / count, count
 
 
-@frozen
-class Cubics:
-    """A motion through states x (n_x, S + 1) with rates (n_x, S + 1) at times t (S + 1,), by Hermite's polynomials."""
-
-    t: np.ndarray
-    x: np.ndarray
-    rates: np.ndarray
-
-    def at(self, k, times):
-        """States (n_x, N) at times (N,) in the intervals k (N,)."""
-        h = np.diff(self.t)[k]
-        s = (times - self.t[k]) / h
-        rise = (3.0 - 2.0 * s) * s**2
-        bend = (1.0 - s) * self.rates[:, k] - s * self.rates[:, k + 1]
-        return self.x[:, k] + rise * (self.x[:, k + 1] - self.x[:, k]) + h * s * (1.0 - s) * bend
-
-    def slope(self, k, times):
-        """Their derivatives."""
-        h = np.diff(self.t)[k]
-        s = (times - self.t[k]) / h
-        bend = (1.0 - s) * (1.0 - 3.0 * s) * self.rates[:, k] - s * (2.0 - 3.0 * s) * self.rates[:, k + 1]
-        return 6.0 * s * (1.0 - s) * (self.x[:, k + 1] - self.x[:, k]) / h + bend
-
-
 class Stepping:
     """One integration: the model in use, the monitor of its pivots, and the motion so far.
 
@@ -250,7 +242,8 @@ class Stepping:
     def _use(self, model):
         poles = isinstance(self.drift, Poles)
         self.model, self.f, self.n_x = model, self._function(model, poles), len(model.state_names)
-        self.p = np.append(model.p, self.drift.coefficients(model)) if poles else model.p
+        self.coefficients = self.drift.coefficients(model) if poles else ()
+        self.p = np.append(model.p, self.coefficients) if poles else model.p
 
     def _function(self, model, poles):
         """The compiled X' and pivots."""
@@ -313,22 +306,15 @@ class Stepping:
 
     def _event(self, stretch, outcome):
         """The `End` at a terminal event within steps before their outcome; None without."""
-        state, fine = self._state_within(stretch), isinstance(outcome, Fine)
-        steps, t = self.events.instants(stretch.t, self.parts)
-        end = stretch.t[outcome.steps] if fine else outcome.t
-        before = self.events.forward * t <= self.events.forward * end
-        steps, t = steps[before], t[before]
-        ends = dict(zip(stretch.t.tolist(), stretch.x.T, strict=True))
-        states = [ends[s] if s in ends else state(k, s) for k, s in zip(steps.tolist(), t.tolist(), strict=True)]
-        if t[-1] != end:
-            steps, t, states = np.append(steps, outcome.steps), np.append(t, end), [*states, outcome.x]
+        end = stretch.t[outcome.steps] if isinstance(outcome, Fine) else outcome.t
+        ends = np.append(stretch.t[: outcome.steps + 1], end)
+        dense = self._states_within(stretch)
 
-        def at(s):
-            k = int(steps[min(np.searchsorted(self.events.forward * t, self.events.forward * s), len(t) - 1)])
-            return self._with_top(np.array([s]), (ends[s] if s in ends else state(k, s))[:, None])[:, 0]
+        def jets_at(t):
+            return self._with_top(t, dense(steps_of(stretch.t, t), t))
 
-        stops = isinstance(outcome, Singular)
-        found = self.events.first(self.model, t, self._with_top(t, np.array(states).T), at, stops)
+        ends = ends[np.append(np.diff(ends) != 0, True)]
+        found = self.events.first(self.model, ends, jets_at, isinstance(outcome, Singular))
         if found is None:
             return None
         k = max(int(np.searchsorted(self.events.forward * stretch.t, self.events.forward * found.t)) - 1, 0)

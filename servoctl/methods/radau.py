@@ -136,15 +136,6 @@ def radau_steps(f, t0, x0, t1, p, h, settings, max_steps):
     return t[: k + 1], x[: k + 1].T, z[:k], float(step[0]), counts
 
 
-def settle(f, t, x, p):
-    """States x (n_x, N) at times t (N,) moved onto the invariants, by the library of `radau_loop`."""
-    rows, t = np.array(x.T, dtype=float, order="C"), np.ascontiguousarray(t, dtype=float)
-    run, p = f.native("settle"), np.ascontiguousarray(p, dtype=float)
-    run.restype = None
-    run(ctypes.c_int64(len(t)), *map(pointer, (t, rows, p)))
-    return rows.T
-
-
 def first_step(f, t, x, p, span, settings):
     """Length of a first step (Hairer, Nørsett and Wanner 1993, II.4); f is a Compiled with the outputs X', pivots."""
     n, power = len(x), 1.0 / (STAGES[settings.order] + 1)
@@ -169,6 +160,11 @@ class Collocated(Steps):
 
     order: int
     z: np.ndarray  # (S, s, n_x) increments of the stages
+
+    @property
+    def nbytes(self):
+        """Memory of the steps."""
+        return self.x.nbytes + self.z.nbytes
 
     def at(self, k, times):
         """States (n_x, N) at times (N,) within steps k (N,), by the collocation polynomials."""
@@ -254,8 +250,5 @@ class RadauSteps(BulkSteps):
         if self.every:
             self.motion.count(projections=len(z) // self.every)
             if t[-1] == b:
-                x = np.column_stack([x[:, :-1], self._settled(t[-1:], x[:, -1:])])
+                x = np.column_stack([x[:, :-1], self.projection.restore_grid(t[-1:], x[:, -1:], self.p)])
         return Collocated(t, x, len(z) < self.most and t[-1] != b, self.settings.order, z)
-
-    def _settled(self, times, states):
-        return settle(self.f, times, states, self.p) if self.every else states

@@ -4,9 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from servoctl.methods.choice import Project
+from servoctl.dense import Hermite
+from servoctl.methods.choice import Poles, Project
 from servoctl.methods.monitor import Fine, Stretch
-from servoctl.methods.motion import Cubics, Stepping, equal_steps
+from servoctl.methods.motion import Stepping, equal_steps
 from servoctl.methods.watch import FINER, End
 
 
@@ -78,10 +79,17 @@ class RungeKuttaSteps(Stepping):
         return b, x
 
     def _record(self, t, states):
-        steps, top = len(t) - 1, slice(self.n_x - self.model.n, self.n_x)
-        self.motion.add(self.model, t, states, self.f.grid(t, states, self.p)[top])
+        steps, jets = len(t) - 1, self._jets(t, states)
+        self.motion.add(self.model, t, jets)
+        self.motion.keep(
+            self.model, t, Hermite(self.model, t, jets, not isinstance(self.drift, Poles)), self.coefficients
+        )
         self.motion.count(steps=steps, nfev=len(self.tableau[1]) * steps)
         self.motion.count(projections=steps // self.every if self.every else 0)
+
+    def _jets(self, t, states):
+        """Jets (n_z, N) of states (n_x, N)."""
+        return np.concatenate([states, self.f.grid(t, states, self.p)[self.n_x - self.model.n : self.n_x]])
 
     def halved(self, model, t, x, h):
         """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
@@ -106,9 +114,9 @@ class RungeKuttaSteps(Stepping):
         return outcome
 
     def _states_within(self, stretch):
-        """X from steps and times within them, by cubics."""
-        rates = self.f.grid(stretch.t, stretch.x, self.p)[: self.n_x]
-        return Cubics(stretch.t, stretch.x, rates).at
+        """X from steps and times within them, by polynomials through all derivatives."""
+        dense = Hermite(self.model, stretch.t, self._jets(stretch.t, stretch.x))
+        return lambda k, t: dense(k, t, self.p)[: self.n_x]
 
     def _state_within(self, stretch):
         """X from (k, t) within steps, by a shorter step from their start."""

@@ -18,6 +18,11 @@ class Solved(Steps):
 
     dense: list  # for each step: states (n_x, N) from times (N,) within it
 
+    @property
+    def nbytes(self):
+        """Memory of the steps: the coefficients of polynomials of a degree up to 8."""
+        return 8 * self.x.nbytes
+
     def at(self, k, times):
         """States (n_x, N) at times (N,) within steps k (N,)."""
         states = np.empty((len(self.x), len(times)))
@@ -48,7 +53,6 @@ class ScipySteps(BulkSteps):
         super()._use(model)
         name = f"{self.f.name}_jacobian"
         self.slopes = model.function(name) if self.method == "Radau" else None
-        self.projection = model.function("ode_projected") if self.projects else None
         self.solver = None
 
     def _rates(self, t, x):
@@ -114,9 +118,6 @@ class ScipySteps(BulkSteps):
         if hasattr(s, "f"):
             s.f = s.fun(s.t, s.y)
         self.motion.count(projections=1)
-
-    def _settled(self, times, states):
-        return self.projection.restore_grid(times, states, self.p) if self.projects else states
 
     def _work(self):
         """Evaluations, Jacobians and decompositions so far."""

@@ -16,6 +16,7 @@ import numpy as np
 from servoctl.codegen.function import Compiled, compiled
 from servoctl.codegen.interpreted import weighted
 from servoctl.codegen.paths import BY_INSTANT
+from servoctl.dense import steps_of
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.methods.choice import Project
@@ -23,7 +24,7 @@ from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
 from servoctl.methods.narrow import arguments, centres
-from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved, steps_of
+from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
 from servoctl.reduction.cascade import Running
@@ -313,19 +314,31 @@ class Unsuited(Exception):
 
 
 def leave_if_stiff(steps, method, limit, t, x):
-    """Leave a motion to a method where stability, of decaying modes up to |hλ| = limit, limits its steps.
+    """Leave a motion to a method where stability limits its steps, with ends t (S + 1,) [s], which lead to x (n_x,).
 
-    These have the ends t (S + 1,) [s], and lead to x (n_x,). A series of order p has a limit of about p/e.
+    Without a method the motion says so.
     """
-    step = abs(t[-1] - t[0]) / (len(t) - 1)
-    if method is None or abs(steps.watch.span) < STIFF_STEPS * step:
-        return
-    jacobian = steps.model.function("ode_jacobian")(t[-1], x, steps.model.p).reshape(len(x), len(x))
-    decay = np.linalg.eigvals(jacobian * np.sign(t[-1] - t[0])) if np.isfinite(jacobian).all() else np.zeros(1)
-    fastest = -decay.real[np.abs(decay.imag) < -decay.real].min(initial=0.0)
-    if LIMITED * step * fastest > limit:
+    length, p = abs(t[-1] - t[0]) / (len(t) - 1), steps.model.p
+    forward, mean = np.copysign(steps.watch.span, t[-1] - t[0]), np.array([length])
+    if stiff(steps.model, t[-1:], x[:, None], p[:, None], mean, forward, limit)[0]:
         why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
-        raise Unsuited(why, method)
+        if method is not None:
+            raise Unsuited(why, method)
+        steps.motion.note = f"{why}, and its forces may err by far: try method='RadauIIA'"
+
+
+def stiff(model, t, x, p, steps, span, limit):
+    """Where stability limits steps of mean lengths (N,) [s] over a span [s]: of decaying modes up to |hλ| = limit.
+
+    They lead to states x (n_x, N) at t (N,), with parameters p (n_p, N). A series of order p has a limit of about p/e.
+    """
+    many, result = np.flatnonzero(abs(span) >= STIFF_STEPS * steps), np.zeros(len(steps), dtype=bool)
+    jacobians = model.function("ode_jacobian").grid(t[many], x[:, many], p[:, many]).T.reshape(-1, len(x), len(x))
+    known = np.isfinite(jacobians).all(axis=(1, 2))
+    modes = np.linalg.eigvals(jacobians[known]) * np.sign(span)
+    fastest = -modes.real.min(axis=1, initial=0.0, where=np.abs(modes.imag) < -modes.real)
+    result[many[known]] = LIMITED * steps[many[known]] * fastest > limit
+    return result
 
 
 class TaylorSteps(Stepping):
@@ -371,9 +384,9 @@ class TaylorSteps(Stepping):
         p, net = np.append(model.p, np.nan), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT), to_knot)
         task, judged = (t0, x0, ends if len(ends) > 1 else float(t1)), resolved(*self.tolerances)
         whole = self.f.whole(task, p, self.tolerances, self.most, t_eval, net, judged)
-        if whole is None or whole[0] == self.most:
+        if whole is None or len(whole[0]) > self.most:
             return False
-        steps, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
+        rows, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
         if "settled" not in self.f.others:
             top = self.rates.grid(t_eval, jets[: self.n_x], model.p)[self.n_x - self.n : self.n_x]
             off = np.abs(top - jets[-self.n :])[:, ~np.isin(t_eval, [*ends[:-1], t1] if to_knot else ends[:-1])]
@@ -384,7 +397,8 @@ class TaylorSteps(Stepping):
             return False
         self.motion.fill(model, t_eval, jets)
         self.motion.largest, self.motion.drifted = states, float(drifted[0])
-        self.motion.count(steps=steps, nfev=steps)
+        self.motion.count(steps=len(rows) - 1, nfev=len(rows) - 1)
+        self.motion.keep(model, rows[:, 0], self._dense(_Log(self.f, self.n_x, p, rows)), (np.nan,))
         self.progress(t1)
         return True
 
@@ -554,22 +568,51 @@ class TaylorSteps(Stepping):
         )
 
     def _sample(self, log, pending, end):
-        """Record the pending samples up to `end` and return those that remain."""
+        """Keep the steps, record the pending samples up to `end` and return those that remain."""
         t = log.t
         if len(t) < 2:
             return pending
         direction = 1.0 if t[-1] >= t[0] else -1.0
+        dense = self._dense(log)
+        self.motion.keep(self.model, t, dense, (np.nan,), end)
         due = direction * pending <= direction * end
         times = pending[due]
         if len(times):
-            by_rows, jets = "settled" in self.f.others, self.settings.jets or 0
-            parts = log.jets(steps_of(t, times), times, max(jets, self.top - (not by_rows)), by_rows)
-            x, top = parts[: self.n_x], parts[self.n_x :]
-            if not len(top) or self.doubted:  # more accurate than as a derivative of the series
-                rates = self.rates.grid(times, x, self.model.p)[self.n_x - self.n : self.n_x]
-                top = np.concatenate([rates, top[self.n :]])
-            self.motion.add(self.model, times, x, top)
+            jets = dense(steps_of(t, times), times, self.p)
+            self.motion.add(self.model, times, jets)
         return pending[~due]
+
+    def _dense(self, log):
+        """What gives the jets within the steps of a log."""
+        by_rows, jets = "settled" in self.f.others, self.settings.jets or 0
+        levels = max(jets, self.top - (not by_rows))
+        # more accurate than as a derivative of the series
+        rates = self.rates if levels < self.top or self.doubted else None
+        return _Between(log, levels, by_rows, rates)
+
+
+@frozen(eq=False)
+class _Between:
+    """Jets within the steps of a log, up to a level; γ^(s̄) by `rates`, where these are not None."""
+
+    log: "_Log"
+    levels: int
+    by_rows: bool
+    rates: object
+
+    @property
+    def nbytes(self):
+        """Memory of the series."""
+        return self.log.rows.nbytes
+
+    def __call__(self, k, t, p):
+        """Jets (n_z, N) at instants t (N,) within steps k (N,)."""
+        n_x, n = self.log.n_x, self.log.f.sizes["n"]
+        jets = replace(self.log, p=p).jets(k, t, self.levels, self.by_rows)
+        if self.rates is None:
+            return jets
+        top = self.rates.grid(t, jets[:n_x], p[:-1])[n_x - n : n_x]
+        return np.concatenate([jets[:n_x], top, jets[n_x + n :]])
 
 
 @frozen

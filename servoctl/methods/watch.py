@@ -55,12 +55,6 @@ class End:
     event: str = ""  # the terminal event that ends the motion there
 
 
-def steps_of(t, times):
-    """The steps with ends t (S + 1,) in which times (N,) lie; an end belongs to the following step."""
-    forward = 1.0 if t[-1] >= t[0] else -1.0
-    return np.clip(np.searchsorted(forward * t, forward * times, "right") - 1, 0, len(t) - 2)
-
-
 def net(t, distance, least):
     """Instants within steps with ends t (S + 1,), in at least so many equal parts, no longer than a distance [s].
 

@@ -28,6 +28,12 @@ def breaks_within(model, span, smoother=SMOOTHER):
     return tuple(sorted(found))
 
 
+def ends_of_pieces(model, span):
+    """Instants within a span at which pieces of paths end, whatever their class."""
+    held = (path.held() for path in required_paths(model.paths).values())
+    return [t for path in held for t in path.breaks_below(np.inf, min(span), max(span)).tolist()]
+
+
 def require_class(name, path, needs, span, jumps):
     """Refuse a path that has too few continuous derivatives inside a span, or is not known there."""
     low, high = span

@@ -166,16 +166,16 @@ def _residuals(mechanism, program, residuals):
 
 def _smooth(mechanism, program, residuals, branches):
     """The mechanism and the program with branches as further parameters."""
-    residuals = dict(zip(residuals, branches.smooth(list(residuals.values()), True), strict=True))
+    residuals = dict(zip(residuals, branches.smooth(list(residuals.values()), "continuous"), strict=True))
     constraints = dict(
-        zip(mechanism.constraints, branches.smooth(list(mechanism.constraints.values()), True), strict=True)
+        zip(mechanism.constraints, branches.smooth(list(mechanism.constraints.values()), "continuous"), strict=True)
     )
     weights, toward = (
         {name: branches.smooth([ca.SX(e)])[0] for name, e in chosen.items()} or None
         for chosen in (program.weights, program.toward)
     )
     columns = {
-        name: ca.reshape(ca.vertcat(*branches.smooth(m.elements())), *m.shape) if m.numel() else m
+        name: ca.reshape(ca.vertcat(*branches.smooth(m.elements(), "principal")), *m.shape) if m.numel() else m
         for name, m in (("balance", mechanism.balance), ("forces", mechanism.forces), ("E", mechanism.E))
     }
     parameters = _extended(mechanism.parameters, [s.branch for s in branches.switches])

@@ -19,9 +19,11 @@ from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, references, s
 from servoctl.reduction.rows import as_rows
 from servoctl.spec.program import no_program
 from servoctl.spec.references import Jets, called, function_of
+from servoctl.tolerances import TINY
 from servoctl.values import Identity
 
 LATEST = 32  # plants whose equations stay in memory
+SMALL = 1e-6  # of the largest terms of a plant's equations: those of a row that may be rounding
 CLEAR = 1e-6  # a mass matrix with unit diagonal and a larger least eigenvalue is clearly positive definite
 
 
@@ -200,16 +202,31 @@ class PlantEquations:
         return self.function("multipliers", list(self.multipliers.values()))
 
     @cached_property
-    def _solved(self):
-        """[γ''; -λ] from [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...], and the pivots."""
-        q, (rows, points) = self.q, self._material
+    def _system(self):
+        """M, G_m, and the right-hand side of [M G_mᵀ; G_m 0] [γ''; -λ] = [forces; ...] in two parts."""
+        q, (rows, _) = self.q, self._material
         acceleration, zero = ca.vertcat(*q.gamma(2)), ca.SX.zeros(q.n)
         second = [q.derivatives([row.expression], 2 - row.order)[-1][0] for row in rows]
-        second = ca.substitute(ca.vertcat(*second), acceleration, zero) if rows else ca.SX(0, 1)
+        second = ca.vertcat(*second) if rows else ca.SX(0, 1)
         driven = self.mechanism.E @ self.force + self.d + self.forces + self.resisting
         force = driven - ca.substitute(self.mechanism.balance, acceleration, zero)
-        solution, pivots = plant_solution(self.mechanism, rows, force, -second, points)
+        rest = ca.substitute(second, acceleration, zero)
+        return self.mechanism.mass, ca.jacobian(second, acceleration), force, -rest
+
+    @cached_property
+    def _solved(self):
+        """[γ''; -λ] and the pivots."""
+        rows, points = self._material
+        solution, pivots = plant_solution(self.mechanism, rows, *self._system[2:], points)
         return ca.cse(solution), pivots
+
+    def unsolved(self):
+        """What [γ''; -λ] leaves of its equations, relative to their terms: at most the rounding of a sound solution."""
+        M, G, *right = self._system
+        matrix, right = ca.blockcat([[M, G.T], [G, ca.SX(G.shape[0], G.shape[0])]]), ca.vertcat(*right)
+        terms = ca.fabs(matrix) @ ca.fabs(self._solved[0]) + ca.fabs(right)
+        left = ca.fabs(matrix @ self._solved[0] - right)
+        return self.function("unsolved", [ca.mmax(left / (terms + SMALL * ca.mmax(terms) + TINY))])
 
     @cached_property
     def state_rates(self):

@@ -29,6 +29,8 @@ from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.references import other_paths, paths_at, require_fixed, required_paths
 from servoctl.values import Value, frozen
 
+UNSOLVED = 1e-7  # of the terms of a plant's equations: rates that leave more have lost half their digits to weak pivots
+
 
 def plant(
     mechanism: Mechanism,
@@ -358,8 +360,9 @@ class Plant(Value, Shown):
         -------
         (n_x,) array
         """
-        x = array_of("x", x, self.n_x)
-        return self.function("ode")(finite("t", t, "time"), x, self.p(array_of("u", u, len(self.inputs)), d))
+        t, x = finite("t", t, "time"), array_of("x", x, self.n_x)
+        p = self.p(array_of("u", u, len(self.inputs)), d)
+        return self.sound_at(t, x, p).function("ode")(t, x, p)
 
     def linearised(self, t, x, u):
         """A = ∂x'/∂x and B = ∂x'/∂u at points.
@@ -378,9 +381,23 @@ class Plant(Value, Shown):
         """
         t = array_of("t", np.atleast_1d(as_numbers(t)), None)
         x, u = array_of("x", x, self.n_x, len(t)), array_of("u", u, len(self.inputs), len(t))
-        y = self.function("jacobian").grid(t, x, self.p(u))
+        p = self.p(u)
+        y, weak = self.function("jacobian").grid(t, x, p), ~self._sound(t, x, p)
+        if weak.any():
+            k = int(np.argmax(weak))
+            y[:, weak] = self.near(t[k], x[:, k]).function("jacobian").grid(t[weak], x[:, weak], p[:, weak])
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
+
+    def sound_at(self, t, x, p):
+        """The plant, or that with the pivots `near` a state where its own are too weak to solve the equations."""
+        return self if self._sound(np.array([t]), x[:, None], p[:, None])[0] else self.near(t, x)
+
+    def _sound(self, t, x, p):
+        """Where the pivots of a plant with constraints are strong enough to solve its equations, at points (N,)."""
+        if not self.mechanism.constraints:
+            return np.ones(len(t), dtype=bool)
+        return self.function("unsolved").grid(t, x, p)[0] <= UNSOLVED
 
     def near(self, t: float, x) -> "Plant":
         """The plant whose pivots are decided near a state, where those decided elsewhere vanish.
@@ -393,10 +410,10 @@ class Plant(Value, Shown):
             [s]
         x : (n_x,) array
         """
-        rest, others = np.zeros(len(self.inputs)), self.equations.others
+        others, place = self.equations.others, (np.array([t]), x[:, None], self.p()[:, None])
         for equations in others:
             plant = replace(self, equations=equations)
-            if np.isfinite(plant.rates(t, x, rest)).all():
+            if plant._sound(*place)[0]:
                 return plant
         followed = references_at(self.paths, t)
         others.append(self.equations.near(t, x, self.parameters[: len(self.equations.values)], followed))
@@ -505,6 +522,7 @@ FUNCTIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "accelerations": lambda e: (e.accelerations(),),
     "outputs": lambda e: (e.outputs(),),
     "multipliers": lambda e: (e.reactions(),),
+    "unsolved": lambda e: (e.unsolved(),),
     "constraints": lambda e: (e.constraints()[1],),
     "constraints_jacobian": lambda e: (e.constraints_jacobian(),),
 }

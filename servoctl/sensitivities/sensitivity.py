@@ -15,7 +15,7 @@ from servoctl.methods.sizes import motion_sizes
 from servoctl.model.equations import invariant_names, signal_groups
 from servoctl.model.following import instant_by, moved_by, p_with_rates
 from servoctl.model.switching import switching
-from servoctl.run import STENCIL, ByName, Run, require_run
+from servoctl.run import ByName, Run, require_run
 from servoctl.sensitivities.boundary import bounded_tangent
 from servoctl.sensitivities.tangent import invariants_by, start_of, tangent_at, variational
 from servoctl.values import Value, frozen
@@ -25,6 +25,7 @@ STIFF = ("Radau", "RadauIIA")  # methods of runs whose variational equation is s
 DEPENDS = 1e-8  # of a column of the invariants' Jacobian: what is left after others, below which it depends on them
 BESIDE_KNOT = 1e-9  # of the span: instants before and after a knot at which rates are compared
 JUMPS = 1e-6  # of the rates: a larger difference there is a jump
+STENCIL = 9  # samples of the polynomial by which a derivative is known between them: error of order h^9
 
 
 @frozen(eq=False)

@@ -8,7 +8,6 @@ import numpy as np
 import servoctl as sv
 from servoctl.codegen.compiler import once
 from servoctl.codegen.function import CALLS
-from servoctl.control.reference import resampled
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.figures.animation import shows_mechanism
 from servoctl.figures.sheet import draw_sheet
@@ -147,7 +146,7 @@ def _planned(args, motion, report):
             request = Request(model.reduction.mechanism, model.reduction.program, motion.span, start, ({}, {}), None)
             run = request.relaxed(after, start, moving=not method and found.dynamics != MARGINAL)
             if args.samples:
-                run = resampled(run, options["t_eval"])
+                run = run.sampled(options["t_eval"])
                 run = replace(run, jets=with_highest(run.model, run.t, run.jets[: len(run.model.state_names)]))
             return motion, run, ""
     except ServoError as error:

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from servoctl.checks import as_list, as_numbers, as_span, by_name, mapping, meant, plain, require_kind, whole
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
-from servoctl.methods.choice import Algebraic, Method, Taylor, as_method
+from servoctl.methods.choice import Algebraic, Automatic, Method, Taylor, as_method
 from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
-from servoctl.methods.taylor import order_for
+from servoctl.methods.taylor import order_for, stiff
 from servoctl.model.following import breaks_within, moved_by, places_of
 from servoctl.model.model import Model, including
 from servoctl.model.start import State
@@ -64,7 +64,8 @@ def simulate_many(
     t_span : (t0, t1)
         [s]; t1 < t0 runs backwards.
     method : Method or str, optional
-        Default: `sv.methods.Taylor()`; for a program that determines the motion completely "algebraic".
+        Default: the Taylor method, or "RadauIIA" for a case where stability limits its steps; for a program that
+        determines the motion completely "algebraic".
     paths : dict of str to sequence of Path, optional
         Paths of each case by the names of references, as for `Model.with_references`; default: those of the model.
     t_eval : (K,) array, optional
@@ -94,7 +95,7 @@ def simulate_many(
     span = as_span(t_span)
     if executor is not None and not isinstance(executor, Executor):
         executor = whole("executor", executor, least=1)
-    method = as_method(method) if method is not None else as_method("algebraic") if model.flat else Taylor()
+    method = as_method(method) if method is not None else Algebraic() if model.flat else Automatic()
     times = sample_times(*span, t_eval, ()).copy() if np.size(t_eval) and t_eval is not None else np.array([])
     all_times = times if len(times) and times[-1] == span[1] else np.append(times, span[1])
     motions = _Many(model, *_case_table(model, starts, parameters, paths), len(all_times))
@@ -264,6 +265,10 @@ class _Many:
         if ends is None:
             return
         good = (ends[:, 0] > 0) & (ends[:, 3] <= OFF)
+        if getattr(method, "for_stiff", None) is not None:
+            steps, at = abs(span[1] - span[0]) / np.maximum(ends[:, 1], 1), np.full(len(which), float(span[1]))
+            last_states = np.ascontiguousarray(ends[:, 4 : 4 + x0.shape[1]].T)
+            good &= ~stiff(self.model, at, last_states, p.T, steps, span[1] - span[0], order / np.e)
         good &= self._tolerances_fit(span, (x0, p), np.ascontiguousarray(ends[:, -x0.shape[1] :].T), method)
         self._take(which[good], ends[good], samples[good])
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from servoctl.checks import as_span, mapping, named, positive, positives, require_kind, text
-from servoctl.control.reference import resampled
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
 from servoctl.markup import Shown
 from servoctl.methods.choice import (
@@ -387,7 +386,7 @@ def _errors_and_cost(comparison, motion, method, treatment, value, seconds):
     runs = [at(comparison.times)]
     if isinstance(method, Taylor) and t1 > t0:
         samples = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), motion.knots)
-        runs.append(resampled(at(samples), comparison.times))
+        runs.append(at(samples).sampled(comparison.times))
     return _errors(comparison, motion, runs) | {
         "operations": motion.model.function("path" if motion.model.flat else "ode").operations,
         "evaluations": run.counters.get("nfev", run.counters.get("iterations", 0)),

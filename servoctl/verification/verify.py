@@ -278,7 +278,7 @@ class _Checks:
         def own_sides(ks):  # whose residuals count, in which angles may have turned round
             ks = ks[first[of[ks]] != first[of[np.searchsorted(sample, sample[ks] + 1)]]]
             t = (self.edges.t[ks] + self.edges.t[ks + 1]) / 2
-            z = np.array([self.run.at(instant) for instant in t]).T
+            z = self.run.at(t)
             return [(flow(model), ks[which]) for model, which in self._sides(self.model, t, z)]
 
         def own_pivots(ks):
