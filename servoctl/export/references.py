@@ -62,7 +62,7 @@ def _tables(model, count, real):
         _require_ascending(name, path, real)
         pieces, _, size = path.coefficients.shape
         sides = (path.before, path.classes[0]), (path.after, path.classes[-1])
-        rules = ", ".join(str(_rule(given, class_, count)) for given, class_ in sides)
+        rules = ", ".join(map(str, [*(_rule(given, class_, count) for given, class_ in sides), *path.rests]))
         numbers = Constant(f"breaks_{i}", path.breaks), Constant(f"numbers_{i}", path.coefficients.ravel())
         texts += [f"\n{constant.declaration('')} = {constant.text};\n" for constant in numbers]
         rows.append(f"    {{{pieces}, {size}, {size}, {rules}, breaks_{i}, numbers_{i}}},\n")

@@ -144,10 +144,16 @@ class Path(Value):
             rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
             result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
         result[1:, held] = 0.0
-        for end, rule, class_ in ((first, self.before, self.classes[0]), (last, self.after, self.classes[-1])):
-            if rule in ("hold", None):  # what is zero by its class is not rounding: a rank may hang on it
-                result[1 : int(min(class_, order)) + 1, t == end] = 0.0
+        for end, rest in zip((first, last), self.rests, strict=True):
+            result[1 : rest + 1, t == end] = 0.0  # what is zero by its class is not rounding: a rank may hang on it
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
+
+    @property
+    def rests(self):
+        """How many derivatives vanish at the first break, and at the last one, by the class there."""
+        ends = (self.before, self.classes[0]), (self.after, self.classes[-1])
+        most = self.coefficients.shape[2]  # others are zero
+        return [int(max(min(class_, most), 0)) if rule in ("hold", None) else 0 for rule, class_ in ends]
 
     def _require_known(self, t, order):
         """Refuse instants (N,) outside, if nothing was said and derivatives up to `order` do not vanish at the end."""
