@@ -107,8 +107,8 @@ def simulate(
     Other arguments
 
     inputs : dict of str to float, Path, SX or callable, optional
-        Of a plant, by actuator, default 0: numbers, paths, expressions of `q.t` and of references, or functions that
-        give these of `q.t`. They act at once, within the plant's limits of magnitude.
+        Of a plant, by actuator, default 0: numbers, paths (those of SciPy, too), smooth expressions of `q.t` and of
+        references, or functions of `q.t` that return such. They act at once, within the plant's limits of magnitude.
     t_eval : (N,) array, optional
         Times of the samples [s], within t_span, or within the window of `Bounded`. Default: 1001 instants and the
         knots; all steps of `RungeKutta`.

@@ -224,6 +224,11 @@ def require_fixed(paths, parameters, names, what):
             )
 
 
+def is_path(value):
+    """Whether a value is a path, or a piecewise polynomial of SciPy, which is called with numbers alone."""
+    return isinstance(value, (Path, ParametricPath)) or hasattr(value, "extrapolate")
+
+
 def followed_path(name, path):
     """The path of one component that a reference follows, from what SciPy makes, too; None for none yet."""
     path = path if path is None or isinstance(path, (Path, ParametricPath)) else as_path(path)
