@@ -20,8 +20,8 @@ def driven(plant, inputs=None, residuals=None):
     """The model of a plant under given inputs, within its limits of magnitude.
 
     A plant with lag, transport delay or limits of rate is refused. Inputs by actuator, 0 by default, are numbers,
-    paths, smooth expressions of `q.t` and of references, or functions of `q.t` that return such; `residuals` are those of
-    a program that the inputs realise approximately, which runs report. Free initial values are all states that the
+    paths, smooth expressions of `q.t` and of references, or functions of `q.t` that return these; `residuals` are those
+    of a program that the inputs realise approximately, which runs report. Free initial values are all states that the
     material constraints leave; outputs include the inputs.
     """
     for what, value in (("lag", plant.lag), ("delay", plant.delay), ("rate_limits", plant.rate_limits)):
@@ -33,9 +33,9 @@ def driven(plant, inputs=None, residuals=None):
                 name=what,
                 value=value,
             )
-    mechanism, values = plant.mechanism, by_name(inputs, plant.inputs, "actuator", "The inputs")
-    given = {name: values.get(name, 0.0) for name in plant.inputs}
-    q, expressions = _expressions(mechanism, given, plant.limits)
+    mechanism = plant.mechanism
+    values = {name: 0.0 for name in plant.inputs} | by_name(inputs, plant.inputs, "actuator", "The inputs")
+    q, expressions = _expressions(mechanism, values, plant.limits)
     count = len(mechanism.parameters.names)
     damping = ca.SX(list(plant.parameters[count : count + plant.equations.damping.numel()]))
     further = plant.equations.forces + ca.substitute(plant.equations.resisting, plant.equations.damping, damping)
@@ -54,17 +54,13 @@ def _expressions(mechanism, values, limits):
     paths = {name: followed_path(name, value) for name, value in values.items() if is_path(value)}
     cut = {name: sides for name, sides in limits.items() if not isinstance(paths.get(name), Path)}
     paths |= {n: within_limits(paths[n].held(), *sides) for n, sides in limits.items() if n in paths and n not in cut}
-    names, clock = {n: _free(n, taken) for n in paths}, _free(CLOCK, (*taken, *values))
+    names, clock = {n: n + "_path" * (n in taken) for n in paths}, CLOCK + "_path" * (CLOCK in (*taken, *values))
     time = {clock: polynomials([0.0, 1.0], [[1.0], [0.0]], before="continue", after="continue")} if cut else {}
     q, r = q.beside(**{names[name]: path for name, path in paths.items()}, **time)
     inputs = {name: r[names[name]] if name in paths else _expression(name, values[name], q) for name in values}
     for name, (low, high) in cut.items():
         inputs[name] = ca.fmin(ca.fmax(ca.substitute(inputs[name], q.t, r[clock]), low), high)
     return q, inputs
-
-
-def _free(name, taken):
-    return f"{name}_path" if name in taken else name
 
 
 def _expression(name, value, q):
