@@ -1,5 +1,7 @@
 """Time-optimal laws along the curve of a program: closed forms, the crane, internal dynamics, refusals."""
 
+import sys
+
 import casadi as ca
 import closed_forms
 import numpy as np
@@ -203,6 +205,7 @@ def test_what_is_no_curve_is_refused():
 
 def test_a_curve_that_no_polynomials_fit_is_refused_without_tolerances(monkeypatch):
     monkeypatch.setattr("servoctl.control.time_optimal.FITTED", 1e-30)
+    monkeypatch.setattr(sys.modules["servoctl.spec.paths.fit"], "FINEST", 100)
     bend = sv.paths.polynomials([0.0, 2.0], [[0.1], [0.5], [0.0]])
     with refused(sv.errors.SpecificationError, "The curve of X bends too sharply", "Make the path smoother") as caught:
         sv.fastest(*mass(lambda q: q.references(X=bend).X), {"push": 30.0}, (0.0, 2.0), shape=True)

@@ -329,10 +329,6 @@ def resting(duration, top, k):
     return Law(duration, fixed, k)
 
 
-def _each(sizes, count):
-    return ca.repmat(ca.DM(sizes), 1, count)
-
-
 def smooth(duration, k):
     """The law of a given duration [s] and class that is nearly a polynomial, `paths.rest_to_rest`."""
     step = np.polynomial.Polynomial([0.0, 1.0])
@@ -400,8 +396,14 @@ class Problem:
             lbg=np.concatenate([zeros, sides[0]]),
             ubg=np.concatenate([zeros, sides[1]]),
         )
-        if words(search.stats()):
-            raise _failed(search.stats())
+        if words(stats := search.stats()):
+            raise IntegrationStopped(
+                f"IPOPT {words(stats)}, after {stats['iter_count']} iterations.",
+                "A time-optimal law is a minimum of the duration.",
+                do="Choose wider limits, a simpler curve, or shape=False.",
+                status=stats["return_status"],
+                iterations=stats["iter_count"],
+            )
         w = np.array(result["x"]).ravel()
         top = w[1 : 1 + s.numel()].reshape(s.shape, order="F")[k] * self.sizes[k]
         return resting(w[0] * self.law.duration, top, k)
@@ -411,13 +413,13 @@ class Problem:
         N, S, k = self.count, len(self.c), self.k
         slopes = (jets[k, 1:] - jets[k, :-1]) * N
         moved = ca.DM(taylor(k, k, 1.0 / N)) @ ca.vertcat(jets[:, :-1], slopes)
-        equal, values, rates = [(jets[:k, 1:] - moved) / _each(self.sizes[:k], N)], [], []
+        equal, values, rates = [(jets[:k, 1:] - moved) / ca.repmat(ca.DM(self.sizes[:k]), 1, N)], [], []
         powers = ca.vertcat(*(duration**i for i in range(self.inverse.c.numel())))
         f = self.inverse.function.map(N)
         for j, place in enumerate(self._stages(jets)):
             rows, value, rate = f(motion[:, j::S], place / ca.repmat(powers, 1, N))
-            equal.append(rows / _each(self.row_size, N))
-            values.append(value / _each(self.value_size, N))
+            equal.append(rows / ca.repmat(ca.DM(self.row_size), 1, N))
+            values.append(value / ca.repmat(ca.DM(self.value_size), 1, N))
             rates.append(rate)
         for i in self.free:
             x = ca.vertcat(*(motion[i, j::S] for j in range(S)))
@@ -435,13 +437,3 @@ class Problem:
         bound[:, 0] = 0.0
         bound[:, -1] = np.eye(self.k + 1)[0]
         return (bound / self.sizes[:, None]).ravel("F")
-
-
-def _failed(stats):
-    return IntegrationStopped(
-        f"IPOPT {words(stats)}, after {stats['iter_count']} iterations.",
-        "A time-optimal law is a minimum of the duration.",
-        do="Choose wider limits, a simpler curve, or shape=False.",
-        status=stats["return_status"],
-        iterations=stats["iter_count"],
-    )

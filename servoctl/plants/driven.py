@@ -33,9 +33,8 @@ def driven(plant, inputs=None, residuals=None):
                 name=what,
                 value=value,
             )
-    mechanism = plant.mechanism
-    values = {name: 0.0 for name in plant.inputs} | by_name(inputs, plant.inputs, "actuator", "The inputs")
-    q, expressions = _expressions(mechanism, values, plant.limits)
+    mechanism, values = plant.mechanism, by_name(inputs, plant.inputs, "actuator", "The inputs")
+    q, expressions = _expressions(mechanism, dict.fromkeys(plant.inputs, 0.0) | values, plant.limits)
     count = len(mechanism.parameters.names)
     damping = ca.SX(list(plant.parameters[count : count + plant.equations.damping.numel()]))
     further = plant.equations.forces + ca.substitute(plant.equations.resisting, plant.equations.damping, damping)

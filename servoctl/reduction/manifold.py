@@ -14,7 +14,7 @@ import numpy as np
 from servoctl.jets.series import Flow
 from servoctl.jets.tape import JETS, REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
-from servoctl.reduction.scales import is_ordinary
+from servoctl.reduction.scales import ORDINARY
 from servoctl.spec.paths.value import numbers_in, parameters_of, path_at
 from servoctl.tolerances import CUTOFF
 from servoctl.values import frozen
@@ -356,6 +356,11 @@ def _random_starts(q, level, context):
     r = sizes * rng.uniform(-1.0, 1.0, (2 * POINTS, len(sizes)))
     r = r if context.followed is None else np.tile(context.followed, (2 * POINTS, 1))
     return np.hstack([t, r]).astype(REAL), z
+
+
+def is_ordinary(size):
+    """Whether points spread by 1 serve for this size, too."""
+    return 1 / ORDINARY < abs(size) < ORDINARY
 
 
 def sizes_of_references(q, parameters, values):

@@ -13,12 +13,20 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.manifold import Context, Points, at_nominal_size, follows, sample, sizes_of_references
+from servoctl.reduction.manifold import (
+    Context,
+    Points,
+    at_nominal_size,
+    follows,
+    is_ordinary,
+    sample,
+    sizes_of_references,
+)
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_rows
-from servoctl.reduction.scales import is_ordinary, usual
+from servoctl.reduction.scales import usual
 from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed

@@ -40,11 +40,6 @@ class Scales:
         return np.concatenate([self.coordinates, *(self.rates / self.time**k for k in range(1, level + 1))])
 
 
-def is_ordinary(size):
-    """Whether points spread by 1 serve for this size, too."""
-    return 1 / ORDINARY < abs(size) < ORDINARY
-
-
 def usual(mechanism, program, guess, values, window, references):
     """The scales of a specification; sizes that are ordinary are 1.
 

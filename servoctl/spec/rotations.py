@@ -24,8 +24,9 @@ HALF_TURN = 1e-6  # [rad] nearness to half a turn, where the shorter way is not 
 
 
 def __getattr__(name):
-    instead = " Take sv.paths.spline through sv.rotations.vectors."
-    raise AttributeError(f"sv.rotations has no {name!r}.{instead * (name == 'spline')}")
+    raise AttributeError(
+        f"sv.rotations has no {name!r}." + " Take sv.paths.spline through sv.rotations.vectors." * (name == "spline")
+    )
 
 
 def turn(angle, axis, start=None):

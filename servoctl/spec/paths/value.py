@@ -145,9 +145,9 @@ class Path(Components, Value):
             terms = taylor(np.abs(self.coefficients[pieces[ends]]), np.arange(ends.sum()), np.ones(ends.sum()), order)
             rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
             result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
+            for end, rest in zip((first, last), self.rests, strict=True):
+                result[1 : rest + 1, ends & (t == end)] = 0.0  # by class, no rounding: a rank may hang on it
         result[1:, held] = 0.0
-        for end, rest in zip((first, last), self.rests, strict=True):
-            result[1 : rest + 1, t == end] = 0.0  # what is zero by its class is not rounding: a rank may hang on it
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
 
     @cached_property
@@ -159,7 +159,7 @@ class Path(Components, Value):
     def rests(self):
         """How many derivatives vanish at the first break, and at the last one, by the class there."""
         return [
-            int(np.clip(class_, 0, self.coefficients.shape[2])) if rule in ("hold", None) else 0
+            int(min(max(class_, 0), self.coefficients.shape[2])) if rule in ("hold", None) else 0
             for rule, class_ in zip((self.before, self.after), self.classes[[0, -1]], strict=True)
         ]
 
@@ -461,6 +461,8 @@ class PathAt(Path):
 
     def __add__(self, other):
         return self.source + other
+
+    __radd__ = __add__  # which counts before the other path's own sum
 
     def __getitem__(self, i):
         return self.source[i]
