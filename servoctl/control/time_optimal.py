@@ -74,7 +74,7 @@ class Curve:
                 "The mechanism",
                 "depends on time",
                 "the mechanism",
-                "Leave q.t and references out of the mechanism, its outputs and weights, or choose shape=False.",
+                "Leave q.t and references out of it, or choose shape=False.",
             )
         for name, e in self.program.with_turns.items():
             w, orders = q.jet(1), orders_in(q, [e])
@@ -85,16 +85,11 @@ class Curve:
                     repr(name),
                     f"contains {', '.join(rates)}",
                     name,
-                    "Integrate it: prescribe the position along a path, or choose shape=False.",
+                    "Integrate it: prescribe a position, or choose shape=False.",
                 )
             along = q.order(e) <= 0 or q.order(e) == 1 and not orders and mechanism.is_zero([ca.jtimes(e, w, w) - e])
             if not along:
-                raise self._refused(
-                    repr(name),
-                    "prescribes rates",
-                    name,
-                    "Prescribe positions, or rates that are proportional to each other, or choose shape=False.",
-                )
+                raise self._refused(repr(name), "prescribes rates", name, "Prescribe positions, or choose shape=False.")
         if not self._paths:
             name = next(iter(self.program.residuals))
             raise self._refused(
@@ -103,10 +98,7 @@ class Curve:
         for name, path in self._paths.items():
             if path.before == "periodic":
                 raise self._refused(
-                    f"The path of {name}",
-                    "is periodic",
-                    name,
-                    "Make it with before='hold', after='hold': it comes to rest.",
+                    f"The path of {name}", "is periodic", name, "Make it with before='hold', after='hold'."
                 )
 
     def _refused(self, what, why, name, do):

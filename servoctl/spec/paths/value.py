@@ -15,7 +15,7 @@ SAME = 1e-13  # of the largest instant of a path: breaks that differ by less are
 COUNTED = 1e-7  # of a derivative's largest value, up to which its jump is rounding: SciPy's monomials of C^9 have 1e-8
 CANCELLING = 16.0  # sum of the terms of a polynomial over its largest value, beyond which it is cut: four binary digits
 SMOOTHEST = 100  # class of a path, beyond which the terms of its polynomials leave the range of a double
-INSTANTS = 51  # of a path, at which its size is read
+PATH_INSTANTS = 51  # of a path, at which its size is read
 HALVINGS = 8  # of a piece: 256 parts, which a path of class 100 needs at its ends
 
 
@@ -153,7 +153,7 @@ class Path(Components, Value):
     @cached_property
     def largest(self):
         """The largest value, by samples."""
-        return float(np.abs(self(np.linspace(*self.breaks[[0, -1]], INSTANTS))).max())
+        return float(np.abs(self(np.linspace(*self.breaks[[0, -1]], PATH_INSTANTS))).max())
 
     @property
     def rests(self):
