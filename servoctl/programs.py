@@ -18,6 +18,7 @@ from servoctl.robots.robot import Frame
 from servoctl.spec import rotations
 from servoctl.spec.coordinates import Coordinates
 from servoctl.spec.mechanism import Mechanism, inverse_directions
+from servoctl.spec.references import is_path
 
 
 def follow_point(name, position, target):
@@ -46,7 +47,7 @@ def follow_point(name, position, target):
     return _entries(name, position - target)
 
 
-def follow_path(name, position, path, along):
+def follow_path(name, position, curve, along):
     """A point stays on a curve: as a reference says, or freely, with the curve's parameter as a further coordinate.
 
     Parameters
@@ -54,25 +55,25 @@ def follow_path(name, position, path, along):
     name : str
     position : SX column or sequence
         The point [m].
-    path : callable
-        The path [m] as a function of its parameter: `lambda s: sv.curves.circle(s, (0, 1), 0.5)`.
+    curve : callable
+        Points [m] as a function of a parameter: `lambda s: sv.curves.circle(s, (0, 1), 0.5)`.
     along : SX
         The parameter: a reference, or the symbol of a coordinate that only says how far the point is; the point is then
-        free along the path.
+        free along the curve.
 
     Returns
     -------
     dict of str to SX
         name_x, name_y, name_z [m].
     """
-    if not callable(path):
+    if is_path(curve) or not callable(curve):
         raise SpecificationError(
-            f"The path of {name!r} is a {type(path).__name__}.",
-            "It is a function of the path's parameter.",
+            f"The curve of {name!r} is a {type(curve).__name__}.",
+            "It is a function of a parameter, which returns points.",
             do="Write lambda s: sv.curves.line(s, start, end); for references X, Z, use follow_point.",
             name=name,
         )
-    return follow_point(name, position, path(_scalar(along, f"the parameter of {name!r}")))
+    return follow_point(name, position, curve(_scalar(along, f"the parameter of {name!r}")))
 
 
 def pose(name, frame, position, rotation):

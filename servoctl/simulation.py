@@ -109,8 +109,8 @@ def simulate(
     Other arguments
 
     inputs : dict of str to float, Path, SX or callable, optional
-        Of a plant, by actuator, default 0: numbers, paths, expressions of `q.t` and of references, or functions that
-        give these of `q.t`. They act at once, within the plant's limits of magnitude.
+        Of a plant, by actuator, default 0: numbers, paths (those of SciPy, too), smooth expressions of `q.t` and of
+        references, or functions of `q.t` that return such. They act at once, within the plant's limits of magnitude.
     max_step : float, optional
         The longest step that a method may take [s]. A path is never stepped over, as steps end where its pieces do; a
         formula of `q.t` or of the state that acts for less than a thousandth of the span may be.

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from refusals import refused
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 
 import servoctl as sv
+from servoctl.errors import SpecificationError
 
 START = {"x": 0.0, "theta": 0.3, "dx": 0.0, "dtheta": 0.0}
 
@@ -106,6 +108,40 @@ def test_inputs_are_paths_which_change_nothing_but_a_table(machine, method, limi
         models.append(run.model)
     assert all(model.function("ode") == models[0].function("ode") for model in models), "nothing is compiled for another path"
     assert machine.mechanism.q.family.paths.keys() <= {"push"}, "the plant's coordinates keep their references"
+
+
+LIMITS = {"trolley": (-1.0, 2.0)}
+
+
+@pytest.mark.parametrize("limits", [{}, LIMITS], ids=["free", "limited"])
+def test_a_spline_of_scipy_is_an_input(machine, limits):
+    curve = CubicSpline([0.0, 0.4, 1.1, 2.0], [0.0, 4.0, -3.0, 1.0])
+    plant = sv.plant(machine.mechanism, limits=limits)
+    run = sv.simulate(plant, START, (0.0, 2.0), inputs={"trolley": curve})
+    assert run["trolley"] == pytest.approx(np.clip(curve(run.t), *limits.get("trolley", (-np.inf, np.inf))), abs=1e-13)
+
+
+@pytest.mark.parametrize("limits", [{}, LIMITS], ids=["free", "limited"])
+@pytest.mark.parametrize("formula", [lambda t: ca.if_else(t < 0.5, 10, -10), lambda t: ca.fmax(t - 0.5, 0)])
+def test_a_formula_that_switches_with_the_time_is_refused_with_and_without_limits(machine, limits, formula):
+    plant = sv.plant(machine.mechanism, limits=limits)
+    for value in (formula, formula(machine.mechanism.q.t)):
+        with refused(SpecificationError, "A switch in the input 'trolley' is decided by the time alone", "sv.paths"):
+            sv.simulate(plant, START, (0.0, 2.0), inputs={"trolley": value})
+
+
+def test_references_of_inputs_have_names_that_the_user_knows(machine):
+    path = sv.paths.rest_to_rest(0.0, sv.parameters(reach=1.0).reach, 1.5)
+    with refused(SpecificationError, "The path of the reference 'trolley' contains reach"):
+        sv.simulate(machine, START, (0.0, 2.0), inputs={"trolley": path})
+    q = sv.coordinates("x")
+    r = q.references(push=PUSH, time=PUSH)
+    mechanism = sv.Mechanism(q, sv.particle(q, 1.0, [q[0]]), forces={"x": r.push + r.time}, actuators={"push": q[0]})
+    for force, names in ((PUSH, {"push", "time", "push_path"}), (ca.sin(q.t), {"push", "time", "time_path"})):
+        run = sv.simulate(sv.plant(mechanism, limits={"push": (-1.0, 1.0)}), {"x": 0.0, "dx": 0.0}, (0.0, 1.5), inputs={"push": force})
+        assert run.model.paths.keys() == names
+        force = PUSH(run.t) if isinstance(force, sv.paths.Path) else np.sin(run.t)
+        assert run["d2x"] == pytest.approx(2 * PUSH(run.t) + np.clip(force, -1.0, 1.0), abs=1e-9)
 
 
 def test_inputs_stay_within_their_limits(machine):

@@ -78,7 +78,7 @@ BAD = {
     "no number": (lambda: one.at(), SpecificationError, {"missing": ["end"]}),
     "another name": (lambda: one.at(ende=1.0), NameUnknown, {"match": "end"}),
     "not finite": (lambda: one.at(end=np.nan), SpecificationError, {}),
-    "no such path": (lambda: PATHS["another clock"].at(ramp=-1.0, when=1.0), SpecificationError, {"name": "duration"}),
+    "no such path": (lambda: PATHS["another clock"].at(ramp=-1.0, when=1.0), SpecificationError, {"names": ("when", "ramp")}),
     "values": (lambda: one(0.5), SpecificationError, {"names": ("end",)}),
     "jets": (lambda: one.jets(0.5, 2), SpecificationError, {"names": ("end",)}),
     "breaks": (lambda: one.breaks, SpecificationError, {"names": ("end",)}),
@@ -289,6 +289,11 @@ def test_parameters_of_paths_that_change_on_the_way_are_refused(supported, crane
     numbers = {name: crane.numbers[name] for name in ("via_x", "via_z", "T")}
     fixed = crane.with_references(**{name: path.source.at(**{n: numbers[n] for n in path.source.names}) for name, path in crane.paths.items()})
     assert sv.export_c(fixed, tmp_path)
+
+
+def test_a_duration_that_is_not_positive_names_the_path_and_its_parameters(crane):
+    with refused(SpecificationError, "The path of the reference 'X'", "T = -1", "lasts for -1 s", "Change"):
+        crane.with_parameters(T=-1.0)
 
 
 def test_parameters_that_the_mechanism_does_not_have_are_refused(crane):

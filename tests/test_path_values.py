@@ -564,9 +564,9 @@ REFUSED = [
     (lambda: polynomials([0.0, 1.0], np.ones(2)), ["(2,)"], {"pieces": 1}),
     (lambda: polynomials([0.0, 1.0], [[1.0], [np.nan]]), ["1 of them finite"], {"pieces": 1}),
     (lambda: polynomials([0.0, 1.0], [[1.0]], before="stay"), ["'stay'", "'hold'"], {"before": "stay"}),
-    (lambda: polynomials([0.0, 1.0], [[1.0]], before="periodic"), ["both sides"], {"after": None}),
+    (lambda: polynomials([0.0, 1.0], [[1.0]], before="periodic"), ["both sides", "before='periodic', after='periodic'"], {"after": None}),
     (lambda: polynomials([0.0, 1.0], [[1.0]], smoothness=1.5), ["smoothness=1.5"], {"smoothness": 1.5}),
-    (lambda: Path([0.0, 1.0], np.ones((2, 1, 3)), [0, 0]), ["(2, 1, 3)"], {"breaks": 2}),
+    (lambda: Path([0.0, 1.0], np.ones((2, 1, 3)), [0, 0]), ["(2, 1, 3)", "sv.paths.polynomials"], {"breaks": 2}),
     (lambda: Path([0.0, 1.0], np.ones((1, 1, 3)), [0, 0, 0]), ["3 classes"], {"breaks": 2}),
     (lambda: Path([0.0, 1.0], np.ones((1, 1, 3)), [0, np.nan]), ["classes"], {"name": "classes"}),
     (lambda: as_path(5.0), ["float"], {"type": "float"}),
@@ -579,7 +579,8 @@ REFUSED = [
     (lambda: ONE([[0.0, 1.0]]), ["(1, 2)"], {"name": "t"}),
     (lambda: ONE.jets(0.5, -1), ["order=-1", "order=0"], {"value": -1}),
     (lambda: ONE.jets(0.5, 2.5), ["order=2.5"], {"value": 2.5}),
-    (lambda: ONE + TWO, ["1 component", "2"], {"dimensions": (1, 2)}),
+    (lambda: ONE + TWO, ["1 component", "2", "path[i]"], {"dimensions": (1, 2)}),
+    (lambda: ONE + AGAIN, ["0 .. 1 s (periodic)", "in one span, or none"], {}),
     (lambda: TWO + 1.0, ["2 components", "1"], {"dimensions": (2, 1)}),
     (lambda: ONE.then(5), ["int"], {"name": "other"}),
     (lambda: ONE - None, ["[None]"], {}),
@@ -592,7 +593,7 @@ REFUSED = [
     (lambda: TWO[2], ["component=2", "component=1"], {"component": 2}),
     (lambda: TWO["x"], ["component='x'"], {"component": "x"}),
     (lambda: rest_to_rest(0.0, 1.0, 0.0), ["duration=0", "greater than 0"], {"name": "duration"}),
-    (lambda: rest_to_rest((0.0, 1.0), 1.0, 1.0), ["start has 2", "end has 1"], {"start": 2, "end": 1}),
+    (lambda: rest_to_rest((0.0, 1.0), 1.0, 1.0), ["start has 2", "end has 1", "Give both as many"], {"start": 2, "end": 1}),
     (lambda: rest_to_rest(np.inf, 1.0, 1.0), ["start"], {"name": "start"}),
     (lambda: rest_to_rest(0.0, 1.0, 1.0, smoothness=101), ["smoothness=101", "to 100"], {"smoothness": 101}),
     (lambda: rest_to_rest(0.0, 1.0, 1.0, t_start=1e300), ["breaks 0 and 1"], {"index": 1}),
@@ -655,6 +656,8 @@ Q = sv.coordinates("x")
 OLD = {
     "rest_to_rest": (lambda: rest_to_rest(Q.t, 0.0, 5.0, duration=6.0), "sv.paths.rest_to_rest(0.0, 5.0, duration=6.0)"),
     "by place": (lambda: rest_to_rest(Q.t, 0.0, 5.0, 6.0, 4), "sv.paths.rest_to_rest(0.0, 5.0, 6.0, smoothness=4)"),
+    "without a duration": (lambda: rest_to_rest(Q.t, 0, 1), "sv.paths.rest_to_rest(0, 1, duration=...)"),
+    "without a ramp": (lambda: trapezoid(2 * Q.t, 1.0, 6.0), "sv.paths.trapezoid(1.0, 6.0, ramp=...)"),
     "spline": (lambda: spline(Q.t, [0, 1], [0, 2], ends="natural"), "sv.paths.spline([0, 1], [0, 2], ends='natural')"),
     "trapezoid": (lambda: trapezoid(t=Q.t, distance=1.0, duration=6.0, ramp=1.0), "distance=1.0, duration=6.0, ramp=1.0"),
 }  # fmt: skip
@@ -673,4 +676,6 @@ def test_what_moved_elsewhere_is_named():
     for name, where in (("line", "sv.curves.line"), ("circle", "sv.curves.circle"), ("piecewise", "sv.paths.polynomials")):
         with pytest.raises(AttributeError, match=where):
             getattr(sv.paths, name)
-    assert not hasattr(sv.paths, "unknown")
+    assert not hasattr(sv.paths, "unknown") and not hasattr(sv.rotations, "unknown")
+    with pytest.raises(AttributeError, match=r"sv.rotations has no 'spline'.*sv.rotations.vectors"):
+        sv.rotations.spline  # noqa: B018

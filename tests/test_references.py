@@ -267,6 +267,36 @@ def test_compiled_jets_are_those_of_the_path():
     assert f.backend == "c" and np.all(np.abs(values - exact) <= 1e-13 * np.abs(exact).max(axis=2, keepdims=True))
 
 
+def joined(before, after):
+    """Two motions with rests between them, and one that begins and ends in motion."""
+    there = sv.paths.rest_to_rest((0.0, 0.1), (3**0.5, 1.0), 4.0, smoothness=4)
+    waits = sv.paths.rest_to_rest((3**0.5, 1.0), (3**0.5, 1.0), 1.0)
+    path = there.then(waits).then(sv.paths.rest_to_rest((3**0.5, 1.0), (12**0.5, -0.3), 3.0, smoothness=2))
+    knots, c = [0.1, 0.7, 1.9], np.random.default_rng(4).normal(size=(6, 2, 2))
+    return path._with(before=before, after=after), sv.paths.polynomials(knots, c, before=before, after=after)
+
+
+@pytest.mark.parametrize("n", [1, 64])
+@pytest.mark.parametrize("sides", [("hold", "hold"), ("continue", "hold"), ("hold", "continue"), ("periodic",) * 2])
+def test_compiled_jets_vanish_where_those_of_the_path_do(n, sides):
+    """At breaks, at ends and beyond them: the same zeros, and elsewhere the same numbers."""
+    q = sv.coordinates("x")
+    r = q.references(a=None, b=None)
+    jets = [s for k in range(7) for s in r.d(k)]
+    f = compiled(function_of(q, r.names, "jets", q[0], ca.SX(0, 1), ca.vertcat(*jets, q[0])), "jets", ("rk",))
+    for path in joined(*sides):
+        a, b = path.breaks[[0, -1]]
+        t = np.concatenate([path.breaks, [a - 1.0, b + 1.0, 2 * a - b, 2 * b - a, (a + b) / 2]])
+        paths, exact, zeros = Followed(path), path.jets(t, 6), 0
+        for i, instant in enumerate(t):
+            found = f.grid(np.full(n, instant), np.zeros((1, n)), np.array([paths.address]))[:-1].reshape(7, 2, n)
+            here = exact[:, :, i, None]
+            assert np.all((found == 0) == (here == 0)), (instant, found[..., 0], here[..., 0])
+            assert np.all(np.abs(found - here) <= 4e-15 * np.abs(exact).max(axis=2, keepdims=True))
+            zeros += (here == 0).sum()
+        assert f.backend == "c" and (zeros > 4 or "hold" not in sides)
+
+
 def test_equal_mechanisms_that_travelled_keep_references_of_their_own():
     """An equal mechanism without references, or along other paths, came first: the copy is not taken for it."""
     bare, _ = crane()

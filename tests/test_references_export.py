@@ -97,6 +97,21 @@ def test_outside_its_breaks_the_table_does_what_the_path_says(rule, model, tmp_p
             assert close(r, residual(t, z, other.p))
 
 
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_where_a_path_rests_the_table_has_the_same_zeros(real, model, tmp_path):
+    """At its ends, at breaks on the way and beyond: of derivatives that vanish no rounding is left."""
+    there = sv.paths.rest_to_rest(0.1, 3**0.5, 4.0)
+    path = there.then(sv.paths.rest_to_rest(3**0.5, 3**0.5, 1.0)).then(sv.paths.rest_to_rest(3**0.5, 12**0.5, 3.0))
+    other = model.with_references(X=path, Z=-path)
+    plan = Exported(export_c(other, tmp_path, name="plan", real=real), "plan")
+    kind = np.float32 if real == "float" else float
+    z, p, r = np.zeros(len(model.jet_names), kind), model.parameters.astype(kind), np.empty(len(plan.indices("r")), kind)
+    for t in (-1.0, *path.breaks[path.classes < 100], 9.0):
+        plan("residuals", ctypes.c_float(t) if real == "float" else t, z, p, r)
+        rates = [k for k, name in enumerate(plan.indices("r")) if "D" in name]
+        assert len(rates) >= 2 and not r[rates].any()
+
+
 def test_in_floats_a_table_has_the_digits_of_floats(model, tmp_path):
     plan = Exported(export_c(model, tmp_path, name="plan", real="float"), "plan")
     z, p = np.linspace(0.3, 1.2, len(model.jet_names)), model.parameters

@@ -58,7 +58,7 @@ def front(crane):
 def integrated(run, plant, t_eval=None):
     """States of the plant under the run's inputs, by SciPy."""
     pieces = [run.t[0], *run.knots, run.t[-1]]
-    paths = [run.model.paths[f"{name}_path"] for name in plant.inputs]
+    paths = [run.model.paths[name] for name in plant.inputs]
     x = np.array([run[name][0] for name in plant.state_names])
     for a, b in zip(pieces[:-1], pieces[1:], strict=True):
         middle = (a + b) / 2  # inside, so that a piece is smooth
@@ -153,7 +153,7 @@ def test_effort_is_counted_from_the_wish(crane, coarse):
 
 def test_limits_hold_at_all_instants(crane):
     run = sv.relaxed(*crane, (0.0, 6.0), weight=1e-6, limits={"cart": 110.0, "dcart": 400.0})
-    dense = run.model.paths["cart_path"](np.linspace(0.0, 6.0, 20_001))
+    dense = run.model.paths["cart"](np.linspace(0.0, 6.0, 20_001))
     assert 110.0 - 1e-3 < np.abs(dense).max() <= 110.0 + 1e-9
     assert np.abs(np.diff(dense)).max() / (6.0 / 20_000) <= 400.0 + 1e-4
     assert sv.verify(run).passed
@@ -170,7 +170,7 @@ def test_bounds_hold_at_their_instants(crane, coarse, bounds, values):
     edges = np.array([0.0, *run.knots, 6.0])
     instants = (edges[:-1, None] + np.diff(edges)[:, None] * np.arange(WATCHED) / WATCHED).ravel()
     there, plant = run.sampled(instants), crane[0]
-    u = run.model.paths["cart_path"]
+    u = run.model.paths["cart"]
     states = there.jets[:4]  # interpolated accelerations have errors where inputs have corners
     rates = [plant.rates(t, x, [u(t)]) for t, x in zip(instants, states.T, strict=True)]
     assert values(replace(there, jets=np.vstack([states, np.transpose(rates)[2:]]))) <= 1.0 + 1e-6

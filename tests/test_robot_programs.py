@@ -280,6 +280,7 @@ def test_a_free_path_is_kept_at_the_speed_that_forces_give():
         (lambda q: sv.programs.follow_point("p", (q["x"], q["y"]), (1,)), "2 entries with 1"),
         (lambda q: sv.programs.curvature("p", q, (q["x"], q["y"], 0), 1.0), "3 entries"),
         (lambda q: sv.programs.follow_path("p", (q["x"],), q["y"], q.t), "follow_point"),
+        (lambda q: sv.programs.follow_path("p", (q["x"],), sv.paths.rest_to_rest(0.0, 1.0, 2.0), q.t), "curve of 'p' is a Path"),
         (lambda q: sv.programs.pose("p", q["x"], (0, 0, 0), np.eye(3)), "Frame"),
         (lambda q: sv.programs.orientation("p", np.eye(2), np.eye(3)), "(2, 2)"),
         (lambda q: sv.programs.formation("p", (q["x"],), {"a": (q["y"],)}, {}), "a"),

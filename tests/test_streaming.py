@@ -27,6 +27,15 @@ def test_a_flat_program_needs_the_jets_alone():
         assert off <= 1e-12 * np.abs(run[name]).max()
 
 
+def test_at_its_solution_a_flat_program_is_evaluated_once(monkeypatch):
+    model, calls = referred.crane(), []
+    step, path = model.feedforward(model.start(guess={"l": 4.0}), HZ), model.function("path")
+    original = type(path).__call__
+    monkeypatch.setattr(type(path), "__call__", lambda self, *given: calls.append(self) or original(self, *given))
+    step(jets_at(model, step))
+    assert [call is path for call in calls].count(True) == 1
+
+
 def test_another_program_keeps_its_state():
     model = referred.cart()
     start, times = model.start(theta=0.1, dtheta=0.0), np.arange(0.0, 201.0) / HZ

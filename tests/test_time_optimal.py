@@ -1,5 +1,7 @@
 """Time-optimal laws along the curve of a program: closed forms, the crane, internal dynamics, refusals."""
 
+import sys
+
 import casadi as ca
 import closed_forms
 import numpy as np
@@ -168,21 +170,28 @@ def test_what_is_no_curve_is_refused():
 
     pushed, wanted = mass(line), {"push": 3.0}
     q = pushed[0].q
-    (x,), t = q, q.t
-    for program, name in (
-        (sv.Program({"X": x * (1.0 + t) - line(q, "Y")}), "X"),
-        (sv.Program({"X": x - 1.0}), "X"),
-        (sv.Program({"X": q.d(1)[0] - t}), "X"),
+    (x,), t, speeds = q, q.t, q.references(V=sv.paths.rest_to_rest(0.0, 1.0, duration=2.0))
+    for program, name, advice in (
+        (sv.Program({"X": x * (1.0 + t) - line(q, "Y")}), "X", "in place of q.t"),
+        (sv.Program({"X": x - 1.0}), "X", "r = q.references(X=path)"),
+        (sv.Program({"X": q.d(1)[0] - 1.0}), "X", "Prescribe positions"),
+        (sv.Program({"X": q.d(1)[0] - speeds.d(1)[0]}), "X", "Integrate it"),
     ):
-        with refused(sv.errors.SpecificationError, name=name):
+        with refused(sv.errors.SpecificationError, advice, name=name):
             sv.fastest(pushed[0], program, wanted, (0.0, 2.0), shape=True)
-    with refused(sv.errors.SpecificationError, "at 0.5", name="X"):
+    with refused(sv.errors.SpecificationError, "at 0.5", "Round it off", name="X"):
         sv.fastest(*mass(there_and_back), wanted, (0.0, 2.0), shape=True)
     corner = sv.paths.polynomials([0.0, 1.0, 2.0], [[1.0, 0.5], [0.0, 1.0]])
-    with refused(sv.errors.SpecificationError, "turns at 0.5 of its span", name="X"):
+    with refused(sv.errors.SpecificationError, "turns at 0.5 of its span", "smoothness=2", name="X"):
         sv.fastest(*mass(lambda q: q.references(X=corner).X), wanted, (0.0, 2.0), shape=True)
     windy = sv.Mechanism(q, gibbs=sv.particle(q, 2.0, x), forces={"x": ca.sin(t)}, actuators={"push": x})
-    with refused(sv.errors.SpecificationError, name="the mechanism"):
+    still, again = sv.paths.polynomials([0.0, 2.0], [[1.0]]), sv.paths.polynomials(
+        [0.0, 1.0, 2.0], [[1.0, -1.0], [0.0, 1.0]], before="periodic", after="periodic"
+    )
+    for path, advice in ((still, "Choose a span"), (again, "before='hold'")):
+        with refused(sv.errors.SpecificationError, advice, name="X"):
+            sv.fastest(*mass(lambda q, path=path: q.references(X=path).X), wanted, (0.0, 2.0), shape=True)
+    with refused(sv.errors.SpecificationError, "Leave q.t and references out", name="the mechanism"):
         sv.fastest(windy, pushed[1], wanted, (0.0, 2.0), shape=True)
     with refused(sv.errors.SpecificationError, name="speed"):
         sv.fastest(
@@ -192,6 +201,15 @@ def test_what_is_no_curve_is_refused():
         sv.fastest(*pushed, wanted, (0.0, 2.0), shape="yes")
     with refused(sv.errors.NameUnknown, name="pull"):
         sv.fastest(*pushed, {"pull": 3.0}, (0.0, 2.0), shape=True)
+
+
+def test_a_curve_that_no_polynomials_fit_is_refused_without_tolerances(monkeypatch):
+    monkeypatch.setattr("servoctl.control.time_optimal.FITTED", 1e-30)
+    monkeypatch.setattr(sys.modules["servoctl.spec.paths.fit"], "FINEST", 100)
+    bend = sv.paths.polynomials([0.0, 2.0], [[0.1], [0.5], [0.0]])
+    with refused(sv.errors.SpecificationError, "The curve of X bends too sharply", "Make the path smoother") as caught:
+        sv.fastest(*mass(lambda q: q.references(X=bend).X), {"push": 30.0}, (0.0, 2.0), shape=True)
+    assert "tolerance" not in str(caught.value)
 
 
 def test_limits_without_a_time_law_are_refused():

@@ -33,7 +33,7 @@ def excesses(run, limits):
 
 def as_read(run, name):
     """The name by which a run has what a limit or bound names: the residual X, beside a reference X, is X_residual."""
-    both = name in run.model.paths and name in run.residual and name not in run.model.reduction.mechanism.signals
+    both = name in run.model.paths and name in [*run.residual] and name not in run.model.reduction.mechanism.signals
     return f"{name}_residual" if both else name
 
 

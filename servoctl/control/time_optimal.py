@@ -55,11 +55,14 @@ class Curve:
         places, rates = self._along(t)
         extent = np.ptp(places, axis=1)
         if not extent.any():
-            raise self._refused(f"The path of {next(iter(paths))}", "stands still in the span", next(iter(paths)))
+            raise self._refused("The curve", "stands still", next(iter(paths)), "Choose a span in which it moves.")
         self.extent = np.where(extent > 0, extent, 1.0)
         speed = self._speed(rates)
-        regular = speed.min() > REGULAR * speed.max()
-        self.pieces = self._by_time() if regular else dict(zip(paths, self._by_arc_length(), strict=True))
+        self.pieces = (
+            self._by_time()
+            if speed.min() > REGULAR * speed.max()
+            else dict(zip(paths, self._by_arc_length(), strict=True))
+        )
 
     def _require_curve(self):
         """Refuse what is no curve: it contains the time itself, or prescribes rates."""
@@ -67,35 +70,48 @@ class Curve:
         fixed = [mechanism.balance, mechanism.E, q.V, q.h, *mechanism.constraints.values(), *mechanism.outputs.values()]
         chosen = [ca.SX(e) for e in (*self.program.weights.values(), *self.program.toward.values())]
         if any(ca.depends_on(e, q.t) for e in (*fixed, *chosen)) or orders_in(q, [*fixed, *chosen]):
-            raise self._refused("The mechanism", "depends on time", "the mechanism")
+            raise self._refused(
+                "The mechanism",
+                "depends on time",
+                "the mechanism",
+                "Leave q.t and references out of it, or choose shape=False.",
+            )
         for name, e in self.program.with_turns.items():
             w, orders = q.jet(1), orders_in(q, [e])
             if ca.depends_on(e, q.t):
-                raise self._refused(repr(name), "contains the time itself", name)
+                raise self._refused(repr(name), "contains the time itself", name, "Write a reference in place of q.t.")
             if rates := [q.family.jet(reference, k).name() for reference, k in orders.items() if k]:
-                raise self._refused(repr(name), f"contains {', '.join(rates)}", name)
+                raise self._refused(
+                    repr(name),
+                    f"contains {', '.join(rates)}",
+                    name,
+                    "Integrate it: prescribe a position, or choose shape=False.",
+                )
             along = q.order(e) <= 0 or q.order(e) == 1 and not orders and mechanism.is_zero([ca.jtimes(e, w, w) - e])
             if not along:
-                raise self._refused(repr(name), "prescribes rates", name)
+                raise self._refused(repr(name), "prescribes rates", name, "Prescribe positions, or choose shape=False.")
         if not self._paths:
             name = next(iter(self.program.residuals))
-            raise self._refused(repr(name), "contains no reference", name)
+            raise self._refused(
+                repr(name), "contains no reference", name, "Write residuals as x - r.X with r = q.references(X=path)."
+            )
         for name, path in self._paths.items():
             if path.before == "periodic":
-                raise self._refused(f"The path of {name}", "is periodic", name)
+                raise self._refused(
+                    f"The path of {name}", "is periodic", name, "Make it with before='hold', after='hold'."
+                )
 
-    def _refused(self, what, why, name):
+    def _refused(self, what, why, name, do):
         return SpecificationError(
             f"{what} {why}.",
             "A time-optimal law runs along a curve, values of references from rest to rest; only its law is open.",
-            do="Write residuals of q and references, as x - r.X with r = q.references(X=path), or choose shape=False.",
+            do=do,
             name=name,
         )
 
     def _along(self, t):
         """Values of the references (k, N) and their rates."""
-        jets = np.concatenate([path.jets(t, 1) for path in self._paths.values()], axis=1)
-        return jets[0], jets[1]
+        return np.concatenate([path.jets(t, 1) for path in self._paths.values()], axis=1)
 
     def _by_time(self):
         """The paths by name with s = (t - t0)/(t1 - t0)."""
@@ -128,7 +144,12 @@ class Curve:
         if not miss.max() < MISSED[1]:
             k, i = np.unravel_index(np.argmax(miss), miss.shape)
             name = list(self._paths)[i]
-            raise self._refused(f"The path of {name}", f"turns sharply at {part[k]:.3g} of the length", name)
+            raise self._refused(
+                f"The path of {name}",
+                f"turns sharply at {part[k]:.3g} of the length",
+                name,
+                "Round it off there, as by sv.paths.spline through its points, or choose shape=False.",
+            )
         return as_path(curve, before="continue", after="continue")
 
     def _speed(self, rates):
@@ -166,11 +187,21 @@ class Curve:
         for name, path in self.pieces.items():
             if rough := [s for s in path.breaks_below(k, 0.0, 1.0).tolist() if 0 < s < 1]:
                 what = f"turns at {rough[0]:.3g} of its span with fewer than {k} continuous derivatives"
-                raise self._refused(f"The path of {name}", what, name)
+                raise self._refused(
+                    f"The path of {name}", what, name, f"Make it with smoothness={k} or more, or choose shape=False."
+                )
         if all(path.coefficients.shape[::2] == (1, 2) for path in self.pieces.values()):
             return {name: path(0.0) + (path(1.0) - path(0.0)) * law for name, path in self.pieces.items()}
         factorials = np.array([float(factorial(j)) for j in range(k + 1)])
-        path = fitted(jets, law.breaks, k, FITTED, "hold", "hold")
+        try:
+            path = fitted(jets, law.breaks, k, FITTED, "hold", "hold")
+        except SpecificationError as error:
+            raise self._refused(
+                f"The curve of {', '.join(self.pieces)}",
+                f"bends too sharply for a law at t = {error.details['t']:.3g} s",
+                next(iter(self.pieces)),
+                "Make the path smoother, or choose shape=False.",
+            ) from error
         return {name: path[i] for i, name in enumerate(self.pieces)}
 
 
@@ -290,10 +321,6 @@ def resting(duration, top, k):
     return Law(duration, fixed, k)
 
 
-def _each(sizes, count):
-    return ca.repmat(ca.DM(sizes), 1, count)
-
-
 def smooth(duration, k):
     """The law of a given duration [s] and class that is nearly a polynomial, `paths.rest_to_rest`."""
     step = np.polynomial.Polynomial([0.0, 1.0])
@@ -361,8 +388,14 @@ class Problem:
             lbg=np.concatenate([zeros, sides[0]]),
             ubg=np.concatenate([zeros, sides[1]]),
         )
-        if words(search.stats()):
-            raise _failed(search.stats())
+        if words(stats := search.stats()):
+            raise IntegrationStopped(
+                f"IPOPT {words(stats)}, after {stats['iter_count']} iterations.",
+                "A time-optimal law is a minimum of the duration.",
+                do="Choose wider limits, a simpler curve, or shape=False.",
+                status=stats["return_status"],
+                iterations=stats["iter_count"],
+            )
         w = np.array(result["x"]).ravel()
         top = w[1 : 1 + s.numel()].reshape(s.shape, order="F")[k] * self.sizes[k]
         return resting(w[0] * self.law.duration, top, k)
@@ -372,13 +405,13 @@ class Problem:
         N, S, k = self.count, len(self.c), self.k
         slopes = (jets[k, 1:] - jets[k, :-1]) * N
         moved = ca.DM(taylor(k, k, 1.0 / N)) @ ca.vertcat(jets[:, :-1], slopes)
-        equal, values, rates = [(jets[:k, 1:] - moved) / _each(self.sizes[:k], N)], [], []
+        equal, values, rates = [(jets[:k, 1:] - moved) / ca.repmat(ca.DM(self.sizes[:k]), 1, N)], [], []
         powers = ca.vertcat(*(duration**i for i in range(self.inverse.c.numel())))
         f = self.inverse.function.map(N)
         for j, place in enumerate(self._stages(jets)):
             rows, value, rate = f(motion[:, j::S], place / ca.repmat(powers, 1, N))
-            equal.append(rows / _each(self.row_size, N))
-            values.append(value / _each(self.value_size, N))
+            equal.append(rows / ca.repmat(ca.DM(self.row_size), 1, N))
+            values.append(value / ca.repmat(ca.DM(self.value_size), 1, N))
             rates.append(rate)
         for i in self.free:
             x = ca.vertcat(*(motion[i, j::S] for j in range(S)))
@@ -396,13 +429,3 @@ class Problem:
         bound[:, 0] = 0.0
         bound[:, -1] = np.eye(self.k + 1)[0]
         return (bound / self.sizes[:, None]).ravel("F")
-
-
-def _failed(stats):
-    return IntegrationStopped(
-        f"IPOPT {words(stats)}, after {stats['iter_count']} iterations.",
-        "A time-optimal law is a minimum of the duration.",
-        do="Choose wider limits, a simpler curve, or shape=False.",
-        status=stats["return_status"],
-        iterations=stats["iter_count"],
-    )

@@ -216,7 +216,7 @@ def _floats(code):
     """Types, literals and functions of floats in place of those of doubles."""
     code = re.sub(r"\bdouble\b", "float", code)
     code = re.sub(rf"\b({FUNCTIONS})(?=\()", r"\1f", code)
-    code = re.sub(r"\bHUGE_VAL\b", "HUGE_VALF", code)
+    code = re.sub(r"\bHUGE_VAL\b", "HUGE_VALF", code).replace("DBL_EPSILON", "FLT_EPSILON")
     return re.sub(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\.?\d+[eE][+-]?\d+)(?![\w.])", _float_literal, code)
 
 

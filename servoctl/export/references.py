@@ -61,11 +61,10 @@ def _tables(model, count, real):
     for i, (name, path) in enumerate(required_paths(model.paths).items()):
         _require_ascending(name, path, real)
         pieces, _, size = path.coefficients.shape
-        sides = (path.before, path.classes[0]), (path.after, path.classes[-1])
-        rules = ", ".join(str(_rule(given, class_, count)) for given, class_ in sides)
+        rules = [*map(_rule, (path.before, path.after), path.classes[[0, -1]], (count, count)), *path.rests]
         numbers = Constant(f"breaks_{i}", path.breaks), Constant(f"numbers_{i}", path.coefficients.ravel())
         texts += [f"\n{constant.declaration('')} = {constant.text};\n" for constant in numbers]
-        rows.append(f"    {{{pieces}, {size}, {size}, {rules}, breaks_{i}, numbers_{i}}},\n")
+        rows.append(f"    {{{pieces}, {size}, {size}, {', '.join(map(str, rules))}, breaks_{i}, numbers_{i}}},\n")
     text = "".join([*texts, f"\nstatic const Path paths[] = {{\n{''.join(rows)}}};\n\n"])
     return text, {"NREFERENCES": len(rows), "MOST": max(count - 1, 0), "OPEN": OPEN}
 

@@ -269,7 +269,9 @@ class Tape:
         raise SpecificationError(
             f"The expression uses {name}.",
             "Expressions of a program or mechanism are differentiated in time, and this operation has no derivative.",
-            do="Use if_else, fmin, fmax or fabs: each of their branches is differentiated.",
+            do="Write its formula in SX; a table over the time is a path, sv.paths.spline(times, points)."
+            if op == ca.OP_CALL
+            else "Use if_else, fmin, fmax or fabs: each of their branches is differentiated.",
             operation=name,
         )
 

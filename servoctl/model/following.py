@@ -9,7 +9,7 @@ from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, REAL
 from servoctl.model.points import with_place
-from servoctl.spec.paths.value import SAME, parameters_of
+from servoctl.spec.paths.value import SAME, numbers_in, parameters_of
 from servoctl.spec.references import required_paths
 
 SMOOTHER = 2  # continuous derivatives of a motion between the nodes of a flat plan: its interpolation uses two
@@ -131,7 +131,7 @@ def _names_in_paths(model):
 
 def _numbers_in_paths(model):
     """Values of the parameters as paths have them."""
-    return dict(zip(_names_in_paths(model).values(), model.parameters.tolist(), strict=True))
+    return numbers_in(model.reduction.mechanism.parameters.symbols, model.parameters)
 
 
 def instants_of(model, t):

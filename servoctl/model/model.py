@@ -173,7 +173,7 @@ class Model(Detailed):
         NameUnknown
             For a name that is no parameter.
         SpecificationError
-            For a value that is not finite, or makes a mass negative.
+            For a value that is not finite, or makes a mass negative, or the duration of a path not positive.
         """
         r = self.reduction
         current = self.numbers

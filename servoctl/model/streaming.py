@@ -92,7 +92,7 @@ class Feedforward:
             y = f(t, q, model.p)
             q = q + y[:nq]
             if np.all(np.abs(y[:nq]) <= CORRECTED * (1.0 + np.abs(q))):
-                return np.concatenate([q, f(t, q, model.p)[first : first + n]])
+                return np.concatenate([q, y[first : first + n]])
         return np.full(nq + n, np.nan)
 
     def _integrated(self, jets, t):

@@ -15,7 +15,7 @@ from servoctl.jets.series import Flow
 from servoctl.jets.tape import JETS, REAL, Book
 from servoctl.reduction.ranks import clean, decide_each
 from servoctl.reduction.scales import ORDINARY
-from servoctl.spec.paths.value import parameters_of, path_at
+from servoctl.spec.paths.value import numbers_in, parameters_of, path_at
 from servoctl.tolerances import CUTOFF
 from servoctl.values import frozen
 
@@ -27,7 +27,6 @@ ON_MANIFOLD = 1e-13  # largest scaled residual of a point: far below ENTRY, so t
 GAUSS_NEWTON_STEPS = 60  # on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
 LEVEL_SWEEPS = 2  # a second one, without gradients in all jets, where the first leaves the rounding of its steps
-PATH_INSTANTS = 51  # of a path, at which its size is read
 AIMING_STEPS = 6  # Gauss-Newton steps of q and references together, before the levels
 SHORTENINGS = 12  # quarterings of a step before the search from a start ends
 SPREAD = 0.1  # relative width of starts about a guess, whose size is its value plus its usual size
@@ -359,14 +358,18 @@ def _random_starts(q, level, context):
     return np.hstack([t, r]).astype(REAL), z
 
 
+def is_ordinary(size):
+    """Whether points spread by 1 serve for this size, too."""
+    return 1 / ORDINARY < abs(size) < ORDINARY
+
+
 def sizes_of_references(q, parameters, values):
     """Largest values (R,) of paths of references, with values (n_p,) of parameters; 1 if ordinary, or for none."""
-    sizes, numbers = np.ones(len(q.family)), dict(zip((p.name() for p in parameters), values, strict=True))
+    sizes, numbers = np.ones(len(q.family)), numbers_in(parameters, values)
     for i, given in enumerate(q.family.paths.values()):
         path = path_at(given, numbers) if {*parameters_of(given)} <= numbers.keys() else None
-        if path is not None:
-            largest = np.abs(path(np.linspace(*path.breaks[[0, -1]], PATH_INSTANTS))).max()
-            sizes[i] = largest if largest > ORDINARY or 0 < largest < 1 / ORDINARY else 1.0
+        if path is not None and path.largest and not is_ordinary(path.largest):
+            sizes[i] = path.largest
     return sizes
 
 

@@ -13,12 +13,20 @@ from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.manifold import Context, Points, at_nominal_size, follows, sample, sizes_of_references
+from servoctl.reduction.manifold import (
+    Context,
+    Points,
+    at_nominal_size,
+    follows,
+    is_ordinary,
+    sample,
+    sizes_of_references,
+)
 from servoctl.reduction.orders import Orders
 from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_rows
-from servoctl.reduction.scales import ORDINARY, usual
+from servoctl.reduction.scales import usual
 from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
@@ -190,7 +198,7 @@ def reduce(mechanism, program, guess=None, near=None, values=None):
     program = require_parts(mechanism, program, guess)
     balance = desired_balance(mechanism, program)
     values = mechanism.parameters.values() if values is None else np.asarray(values, dtype=float)
-    plain, errors = guess is None if near else all(map(_ordinary, filter(None, (guess or {}).values()))), {}
+    plain, errors = guess is None if near else all(map(is_ordinary, filter(None, (guess or {}).values()))), {}
     for scaled in (not plain,) if near else (not plain, plain):  # a guess far from the origin tells no size
         scales = None
         if scaled:
@@ -367,11 +375,6 @@ def _context(mechanism, guess, near, values, scales=None):
 def _window(scale):
     """The window (t0, t1) [s] in which points are drawn, from a time scale [s]."""
     return WINDOW[0] * scale, WINDOW[1] * scale
-
-
-def _ordinary(size):
-    """Whether points spread by 1 serve for this size, too."""
-    return 1 / ORDINARY < abs(size) < ORDINARY
 
 
 def _time_scale(q, jets, scales):

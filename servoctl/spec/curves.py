@@ -88,7 +88,8 @@ def _column(value, what):
     if not items or (len(shape) == 2 and 1 not in shape):
         raise SpecificationError(
             f"{what} has the shape {shape or (0,)}.",
-            "A point of a path is a number or a vector with at least one entry.",
+            "A point of a curve is a number or a vector with at least one entry.",
+            do="Write a number, or a list of coordinates.",
             what=what,
             shape=shape,
         )
@@ -112,14 +113,21 @@ def _orthonormal(axes, centre):
     """Two orthonormal vectors of the size of `centre`."""
     if not isinstance(axes, (list, tuple, np.ndarray)) or len(as_list(axes) or ()) != 2:
         raise SpecificationError(
-            f"The circle's axes are {axes!r}.", "A pair of orthonormal vectors spans its plane.", axes=axes
+            f"The circle's axes are {axes!r}.",
+            "A pair of orthonormal vectors spans its plane.",
+            do="Write axes=((1, 0, 0), (0, 1, 0)) for the plane z = const.",
+            axes=axes,
         )
     e1, e2 = (_column(axis, f"axes[{i}]") for i, axis in enumerate(axes))
     _same_size(centre=centre, **{"axes[0]": e1, "axes[1]": e2})
     gram = ca.vertcat(ca.dot(e1, e1) - 1, ca.dot(e1, e2), ca.dot(e2, e2) - 1)
     if gram.is_constant() and np.abs(np.array(ca.DM(gram))).max() > ORTHONORMAL:
         raise SpecificationError(
-            f"The circle's axes are {axes!r}.", "Axes are orthonormal.", _orthonormalised(e1, e2), axes=axes
+            f"The circle's axes are {axes!r}.",
+            "Axes are orthonormal.",
+            _orthonormalised(e1, e2),
+            "Give two unit vectors at a right angle.",
+            axes=axes,
         )
     return e1, e2
 
@@ -141,5 +149,6 @@ def _same_size(**columns):
         raise SpecificationError(
             ", ".join(f"{name} has {n} entries" for name, n in sizes.items()) + ".",
             "They are vectors of the same space, and have the same number of entries.",
+            do="Give all of them as many entries.",
             **sizes,
         )

@@ -662,7 +662,7 @@ def inverse_directions(E):
     return ca.DM(np.linalg.inv(numbers)) if np.linalg.matrix_rank(numbers) == len(numbers) else None
 
 
-def _require_no_switch(expression, q, what):
+def require_no_switch(expression, q, what):
     """Refuse an operation with branches that the time alone decides: what comes from data has its instants, too."""
     if not ca.depends_on(expression, q.t):
         return
@@ -671,7 +671,7 @@ def _require_no_switch(expression, q, what):
     for switch in branches.switches:
         if not any(map(q.moves, ca.symvar(switch.function))):
             raise SpecificationError(
-                f"{what[0].upper()}{what[1:]} switches with the time alone, where {switch.text}.",
+                f"A switch in {what[0].lower()}{what[1:]} is decided by the time alone, where {switch.text}.",
                 "Formulas of q.t are smooth; a signal that switches is a path, which knows its instants.",
                 do="Write r = q.references(r=first.then(second)).r with paths of sv.paths in place of "
                 "if_else(q.t < ..., ...), or sv.paths.polynomials(breaks, coefficients) in place of fmin and fmax.",
@@ -683,7 +683,7 @@ def _require_no_switch(expression, q, what):
 def require_known(expression, mechanism, what):
     """Refuse a symbol that is no coordinate, jet, parameter or t of the mechanism, and a switch in t alone."""
     q, known = mechanism.q, {s.element_hash() for s in mechanism.parameters.symbols}
-    _require_no_switch(expression, q, what)
+    require_no_switch(expression, q, what)
     for s in ca.symvar(expression):
         if q.where(s) is None and s.element_hash() not in known:
             if (error := mechanism.no("symbol", s.name(), ())).details.get("left_out"):

@@ -11,7 +11,7 @@ from servoctl.errors import SpecificationError
 from servoctl.jets.tape import JETS, column_of
 from servoctl.spec.paths.parametric import ParametricPath
 from servoctl.spec.paths.scipy_paths import as_path
-from servoctl.spec.paths.value import Path, parameters_of, path_at
+from servoctl.spec.paths.value import Path, numbers_in, parameters_of, path_at
 
 _lock = threading.Lock()
 
@@ -196,7 +196,7 @@ def paths_at(paths, parameters, values):
     """The paths by name with the values (n_p,) of parameters that they contain."""
     if not any(map(parameters_of, paths.values())):
         return paths
-    written = {s.name(): float(value) for s, value in zip(parameters.symbols, values, strict=False)}
+    written = numbers_in(parameters.symbols, values)
     for name, path in paths.items():
         if unknown_ones := [one for one in parameters_of(path) if one not in written]:
             raise SpecificationError(
@@ -207,7 +207,7 @@ def paths_at(paths, parameters, values):
                 name=name,
                 names=unknown_ones,
             )
-    return {name: path_at(path, written) for name, path in paths.items()}
+    return {name: path_at(path, written, f"The path of the reference {name!r}") for name, path in paths.items()}
 
 
 def require_fixed(paths, parameters, names, what):
@@ -222,6 +222,11 @@ def require_fixed(paths, parameters, names, what):
                 name=reference,
                 names=both,
             )
+
+
+def is_path(value):
+    """Whether a value is a path, or a piecewise polynomial of SciPy, which is called with numbers alone."""
+    return isinstance(value, (Path, ParametricPath)) or hasattr(value, "extrapolate")
 
 
 def followed_path(name, path):

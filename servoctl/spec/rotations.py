@@ -23,6 +23,12 @@ ORTHONORMAL = 1e-9  # largest difference of RᵀR from the identity
 HALF_TURN = 1e-6  # [rad] nearness to half a turn, where the shorter way is not determined
 
 
+def __getattr__(name):
+    raise AttributeError(
+        f"sv.rotations has no {name!r}." + " Take sv.paths.spline through sv.rotations.vectors." * (name == "spline")
+    )
+
+
 def turn(angle, axis, start=None):
     """Turn about an axis that is fixed in the world: R = exp(angle [axis]) start.
 

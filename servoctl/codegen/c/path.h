@@ -10,7 +10,8 @@ static __attribute__((noinline, optimize("O3"))) \
 void path_jets_##K(double paths, double instant, double t, int64_t n, double *out) \
 { \
     for (int64_t i = 0; i < n; i++) { \
-        const Piece piece = path_at((const Path *)(uintptr_t)paths + i, instant, t); \
+        const Path *path = (const Path *)(uintptr_t)paths + i; \
+        const Piece piece = path_at(path, instant, t); \
         double r[K + 1], factor = 1; \
         _Pragma("GCC unroll 64") for (int64_t k = 0; k <= K; k++) r[k] = 0; \
         for (int64_t j = piece.size - 1; j >= 0; j--) { \
@@ -21,6 +22,7 @@ void path_jets_##K(double paths, double instant, double t, int64_t n, double *ou
             out[k * n + i] = r[k] * factor; \
             factor *= (double)(k + 1) * piece.scale; \
         } \
+        if (fabs(piece.tau) == 1) path_rest(path, &piece, K, n, out + i); \
     } \
 }
 

@@ -29,6 +29,9 @@ void w_path_jets_##K(W paths, W instant, W t, int64_t n, W *out) \
             out[k * n + at] = r[k] * factor; \
             factor *= (double)(k + 1) * scale; \
         } \
+        if (w_any((tau == 1.0) | (tau == -1.0))) EACH_LANE if (fabs(piece[i].tau) == 1) { \
+            path_rest((const Path *)(uintptr_t)paths[i] + at, piece + i, K, n * W_LANES, (double *)(out + at) + i); \
+        } \
     } \
 }
 

@@ -4,9 +4,12 @@
 #ifndef PIECE_H
 #define PIECE_H
 
+#include <float.h>
+
 typedef struct {
     int64_t pieces, row, size; /* numbers of pieces, from one piece to the next, and of coefficients of a piece */
     int64_t before, after;     /* outside: 0 the value is held, 1 the end piece goes on, 2 all pieces repeat */
+    int64_t first, last;       /* how many derivatives vanish at the first break, and at the last one */
     const double *breaks, *c;  /* pieces + 1 instants; coefficients of the powers of a time from -1 to 1 on each piece */
 } Path;
 
@@ -44,10 +47,25 @@ static Piece path_at(const Path *path, double instant, double t)
     const int64_t k = path_piece(path, instant);
     const double low = path->breaks[k], high = path->breaks[k + 1];
     const int held = (instant < first && !path->before) || (instant > last && !path->after);
-    const Piece piece = {path->c + k * path->row, path->size,
-                         held ? (instant < first ? -1.0 : 1.0) : ((t - low) + (t - high)) / (high - low),
-                         held ? 0.0 : 2.0 / (high - low)};
-    return piece;
+    const double tau = held ? (instant < first ? -1.0 : 1.0) : ((t - low) + (t - high)) / (high - low);
+    return (Piece){path->c + k * path->row, path->size, tau, held ? 0.0 : 2.0 / (high - low)};
+}
+
+/* At an end of a piece: derivatives r, a stride apart, that vanish are zero; rounding would determine directions. */
+static void path_rest(const Path *path, const Piece *piece, int64_t most, int64_t stride, double *r)
+{
+    const int64_t first = piece->tau < 0 && piece->c == path->c ? path->first : 0;
+    const int64_t last = piece->tau > 0 && piece->c == path->c + (path->pieces - 1) * path->row ? path->last : 0;
+    double rounding = (double)piece->size * DBL_EPSILON;
+    for (int64_t k = 0; k <= most; k++) {
+        double terms = 0, binomial = 1;
+        for (int64_t j = k; j < piece->size; j++) {
+            terms += binomial * fabs(piece->c[j]);
+            binomial *= (double)(j + 1) / (double)(j + 1 - k);
+        }
+        if ((k > 0 && k <= first + last) || fabs(r[k * stride]) <= rounding * terms) r[k * stride] = 0;
+        rounding *= (double)(k + 1) * piece->scale;
+    }
 }
 
 #endif

@@ -32,4 +32,4 @@ void actuation(double t, const double *x, const double *p, double *y);
 void law(double t, const double *x, const double *p, double *y);
 static const int knot[KNOTS] = {0, 1};
 static const double z0[NZ] = {0}, table[2 * ROWS * WIDTH] = {0};
-static const Path paths[NREFERENCES] = {{0, 0, 0, 0, 0, 0, 0}};
+static const Path paths[NREFERENCES] = {{0, 0, 0, 0, 0, 0, 0, 0, 0}};

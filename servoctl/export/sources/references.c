@@ -17,5 +17,6 @@ static void references(double t, int most, double *jets)
             jets[k * NREFERENCES + i] = r[k] * factor;
             factor *= (double)(k + 1) * piece.scale;
         }
+        if (fabs(piece.tau) == 1) path_rest(path, &piece, most, NREFERENCES, jets + i);
     }
 }

@@ -30,17 +30,18 @@ def without_time(maker: Any) -> Any:
     @functools.wraps(maker)
     def made(*args, **kwargs):
         try:
-            given = timed.bind(*args, **kwargs).arguments
+            given = timed.bind_partial(*args, **kwargs).arguments
         except TypeError:
             return maker(*args, **kwargs)
-        if not isinstance(given["t"], ca.SX):
+        time, needed = given.pop("t", None), [p.name for p in parameters if p.default is p.empty]
+        missing = [name for name in needed if name not in given]
+        if not isinstance(time, ca.SX) or missing and "t" not in map(ca.SX.name, ca.symvar(time)):
             return maker(*args, **kwargs)
-        time, *others = given.items()
-        shown = [(name, text if len(text := _shown(value)) < 40 else name) for name, value in others]
-        plain = {p.name for p in parameters if p.default is p.empty and p.name not in kwargs}
+        shown = [(name, text if len(text := _shown(value)) < 40 else name) for name, value in given.items()]
+        shown, plain = shown + [(name, "...") for name in missing], {*needed} - kwargs.keys() - {*missing}
         line = f"sv.paths.{maker.__name__}({', '.join(x if name in plain else f'{name}={x}' for name, x in shown)})"
         raise SpecificationError(
-            f"{maker.__name__} was called with {_shown(time[1])} before its other arguments.",
+            f"{maker.__name__} was called with {_shown(time)} before its other arguments.",
             "It makes a path: data with numbers, which a reference follows in time.",
             nearest=f"{line}.",
             do=f"Write r = q.references(X={line}), and r.X in the program.",
@@ -357,7 +358,7 @@ def _ends(start, end):
     start, end = vector("start", start), vector("end", end)
     if len(start) != len(end):
         given, rule = f"start has {len(start)} entries, end has {len(end)}.", "They are vectors of the same size."
-        raise SpecificationError(given, rule, start=len(start), end=len(end))
+        raise SpecificationError(given, rule, do="Give both as many entries.", start=len(start), end=len(end))
     return start, end
 
 

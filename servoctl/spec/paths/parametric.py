@@ -13,13 +13,40 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import by_name, column, finite, positive, whole_of
+from servoctl.checks import by_name, column, finite, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.values import Value, frozen
 
 
+class Components:
+    """What paths of numbers and of expressions have in common: `dim` components, and arithmetic from the other side."""
+
+    __array_ufunc__ = None  # a number of NumPy times a path is a path
+
+    def __len__(self):
+        return self.dim
+
+    def __iter__(self):
+        return (self[i] for i in range(self.dim))
+
+    def __neg__(self):
+        return self * -1.0
+
+    def __radd__(self, other):
+        return self + other
+
+    def __rmul__(self, factor):
+        return self * factor
+
+    def __sub__(self, other):
+        return -(-self + other)
+
+    def __rsub__(self, other):
+        return -self + other
+
+
 @frozen(eq=False)
-class ParametricPath(Value):
+class ParametricPath(Components, Value):
     """A path whose numbers are expressions of parameters; made by `sv.paths` where these stand in place of numbers.
 
     A model follows it with its own numbers of the parameters, and another path after `with_parameters`. It is added to
@@ -41,7 +68,6 @@ class ParametricPath(Value):
     names: tuple
     dim: int
     content: str
-    __array_ufunc__ = None  # as of `Path`
 
     def at(self, **numbers: float) -> Any:
         """The path with numbers of its parameters.
@@ -84,12 +110,19 @@ class ParametricPath(Value):
         """A, b, t0 and T as expressions of symbols with the names of the parameters."""
         return self._function(self._symbols)
 
-    def made(self, numbers):
-        """The path with numbers of the parameters by name, among others."""
+    def made(self, numbers, what="The path"):
+        """The path with numbers of the parameters by name, among others; `what` it is begins a message."""
         A, b, t0, T = (np.array(part) for part in self._function([numbers[name] for name in self.names]))
+        if not 0 < T[0, 0] < np.inf:
+            raise SpecificationError(
+                f"{what} lasts for {T[0, 0] * np.ptp(self.base.breaks):g} s.",
+                "A path has a positive, finite duration.",
+                do=f"Change {', '.join(self.names) or 'its duration'}.",
+                names=self.names,
+            )
         coefficients = A @ self.base.coefficients
         coefficients[:, :, 0] += b[:, 0]
-        breaks = t0[0, 0] + positive("duration", T[0, 0]) * self.base.breaks
+        breaks = t0[0, 0] + T[0, 0] * self.base.breaks
         return self.base._with(breaks=breaks, coefficients=coefficients)
 
     @cached_property
@@ -138,12 +171,6 @@ class ParametricPath(Value):
                 names=self.names,
             )
 
-    def __len__(self):
-        return self.dim
-
-    def __iter__(self):
-        return (self[i] for i in range(self.dim))
-
     def __getitem__(self, i):
         A, b, t0, T = self._forms()
         i = range(self.dim)[whole_of("component", i, range(-self.dim, self.dim))]
@@ -153,11 +180,6 @@ class ParametricPath(Value):
         A, b, t0, T = self._forms()
         factor = column(factor, "multiple of a path", 1)[0]
         return parametric(self.base, factor * A, factor * b, t0, T)
-
-    __rmul__ = __mul__
-
-    def __neg__(self):
-        return self * -1.0
 
     def __add__(self, other):
         """The sum with a constant: a number or an expression, or a vector (dim,) of them."""
@@ -169,14 +191,6 @@ class ParametricPath(Value):
             )
         A, b, t0, T = self._forms()
         return parametric(self.base, A, b + ca.vertcat(*column(other, "constant", self.dim)), t0, T)
-
-    __radd__ = __add__
-
-    def __sub__(self, other):
-        return -(-self + other)
-
-    def __rsub__(self, other):
-        return -self + other
 
     def at_rate(self, factor, about=None):
         """The path that runs so many times as fast, with `about` [s], by default its first break, where it was."""

@@ -1,12 +1,13 @@
 """Paths as values: polynomials of time between breaks, with their derivatives and the class at each break."""
 
 from dataclasses import field
+from functools import cached_property
 
 import numpy as np
 
 from servoctl.checks import MOST_JETS, array_of, as_numbers, finite, positive, require_kind, whole, whole_of
 from servoctl.errors import SpecificationError
-from servoctl.spec.paths.parametric import ParametricPath, expressed, varies
+from servoctl.spec.paths.parametric import Components, ParametricPath, expressed, varies
 from servoctl.values import Value, frozen, read_only
 
 RULES = ("hold", "continue", "periodic", None)
@@ -14,11 +15,12 @@ SAME = 1e-13  # of the largest instant of a path: breaks that differ by less are
 COUNTED = 1e-7  # of a derivative's largest value, up to which its jump is rounding: SciPy's monomials of C^9 have 1e-8
 CANCELLING = 16.0  # sum of the terms of a polynomial over its largest value, beyond which it is cut: four binary digits
 SMOOTHEST = 100  # class of a path, beyond which the terms of its polynomials leave the range of a double
+PATH_INSTANTS = 51  # of a path, at which its size is read
 HALVINGS = 8  # of a piece: 256 parts, which a path of class 100 needs at its ends
 
 
 @frozen(eq=False)
-class Path(Value):
+class Path(Components, Value):
     """A signal that is known with its derivatives: polynomials of time between breaks; made by `sv.paths`.
 
     `path(t)` is its value, `jets` has its derivatives, too. Paths are added, subtracted and multiplied by numbers;
@@ -48,7 +50,6 @@ class Path(Value):
     before: str | None = None
     after: str | None = None
     remark: str = field(default="", compare=False)
-    __array_ufunc__ = None  # a number of NumPy times a path is a path
 
     def __post_init__(self):
         arrays = {"breaks": (None,), "coefficients": (None, None, None), "classes": (None,)}
@@ -61,6 +62,7 @@ class Path(Value):
             raise SpecificationError(
                 f"There are {pieces + 1} breaks, {len(self.classes)} classes, and coefficients of the shape {shape}.",
                 "Each break has a class, and each piece between two breaks the coefficients of each component.",
+                do="Use sv.paths.polynomials(breaks, coefficients), which counts the classes.",
                 breaks=pieces + 1,
                 shape=shape,
             )
@@ -143,11 +145,23 @@ class Path(Value):
             terms = taylor(np.abs(self.coefficients[pieces[ends]]), np.arange(ends.sum()), np.ones(ends.sum()), order)
             rounding = self.coefficients.shape[2] * np.finfo(float).eps * terms
             result[:, ends] = np.where(np.abs(result[:, ends]) <= rounding, 0.0, result[:, ends])
+            for end, rest in zip((first, last), self.rests, strict=True):
+                result[1 : rest + 1, ends & (t == end)] = 0.0  # by class, no rounding: a rank may hang on it
         result[1:, held] = 0.0
-        for end, rule, class_ in ((first, self.before, self.classes[0]), (last, self.after, self.classes[-1])):
-            if rule in ("hold", None):  # what is zero by its class is not rounding: a rank may hang on it
-                result[1 : int(min(class_, order)) + 1, t == end] = 0.0
         return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
+
+    @cached_property
+    def largest(self):
+        """The largest value, by samples."""
+        return float(np.abs(self(np.linspace(*self.breaks[[0, -1]], PATH_INSTANTS))).max())
+
+    @property
+    def rests(self):
+        """How many derivatives vanish at the first break, and at the last one, by the class there."""
+        return [
+            int(min(max(class_, 0), self.coefficients.shape[2])) if rule in ("hold", None) else 0
+            for rule, class_ in zip((self.before, self.after), self.classes[[0, -1]], strict=True)
+        ]
 
     def _require_known(self, t, order):
         """Refuse instants (N,) outside, if nothing was said and derivatives up to `order` do not vanish at the end."""
@@ -187,12 +201,6 @@ class Path(Value):
             breaks = np.unique(breaks + period * turns[:, None])
         return breaks[(low <= breaks) & (breaks <= high)]
 
-    def __len__(self):
-        return self.dim
-
-    def __iter__(self):
-        return (self[i] for i in range(self.dim))
-
     def __getitem__(self, i):
         i = whole_of("component", i, range(-self.dim, self.dim))
         return self._with(coefficients=self.coefficients[:, [i]])
@@ -210,17 +218,12 @@ class Path(Value):
             return self._parametric() * factor
         return self._with(coefficients=self.coefficients * finite("factor", factor, "multiple of a path"))
 
-    __rmul__ = __mul__
-
-    def __neg__(self):
-        return self * -1.0
-
     def __add__(self, other):
         """The sum with a path, or with a constant: a number or a vector (dim,)."""
         if varies(other) or isinstance(other, ParametricPath):
             return self._parametric() + other
         if not isinstance(other, Path):
-            constant = vector("The constant added to a path", other)
+            constant = vector("The constant of a sum with a path", other)
             _require_dim(self.dim, len(constant))
             coefficients = self.coefficients.copy()
             coefficients[:, :, 0] += constant
@@ -228,16 +231,6 @@ class Path(Value):
         _require_dim(self.dim, other.dim)
         (first, second), fields = together(self, other)
         return Path(coefficients=first + second, **fields)
-
-    __radd__ = __add__
-
-    def __sub__(self, other):
-        if varies(other) or isinstance(other, ParametricPath):
-            return -(-self + other)
-        return self + (-other if isinstance(other, Path) else -vector("The constant taken from a path", other))
-
-    def __rsub__(self, other):
-        return -self + other
 
     def then(self, other):
         """The path, and then another one, moved in time to begin where it ends.
@@ -325,8 +318,8 @@ class Path(Value):
 
 def _require_dim(dim, other):
     if dim != other:
-        rule = "Paths are joined component by component."
-        raise SpecificationError(f"One has {dim} components, the other {other}.", rule, dimensions=(dim, other))
+        rule, do = "Paths are joined component by component.", "Take components, path[i], or give as many of each."
+        raise SpecificationError(f"One has {dim} components, the other {other}.", rule, do=do, dimensions=(dim, other))
 
 
 def vector(name, value):
@@ -372,6 +365,7 @@ def _require_rules(before, after):
         raise SpecificationError(
             f"The path has before={before!r}, after={after!r}.",
             f"Each is one of {', '.join(map(repr, RULES))}, and a path that is periodic is so on both sides.",
+            do="Say for each side what the path does there, or before='periodic', after='periodic'.",
             before=before,
             after=after,
         )
@@ -431,8 +425,8 @@ def together(*paths):
     spans = [p.breaks[[0, -1]] for p in paths]
     if {p.before for p in paths} > {"periodic"} or paths[0].before == "periodic" and np.ptp(spans, axis=0).max() > near:
         given = ", ".join(f"{a:g} .. {b:g} s ({p.before})" for (a, b), p in zip(spans, paths, strict=True))
-        rule = "A periodic path is joined to others of the same period."
-        raise SpecificationError(f"The spans of the paths are {given}.", rule, spans=spans)
+        rule, do = "A periodic path is joined to others of the same period.", "Repeat all in one span, or none."
+        raise SpecificationError(f"The spans of the paths are {given}.", rule, do=do, spans=spans)
     breaks = breaks[np.append(True, np.diff(breaks) > near)]
     half, classes = np.diff(breaks) / 2, np.full(len(breaks), np.inf)
     middles = breaks[:-1] + half
@@ -465,18 +459,10 @@ class PathAt(Path):
     def __mul__(self, factor):
         return self.source * factor
 
-    __rmul__ = __mul__
-
     def __add__(self, other):
         return self.source + other
 
-    __radd__ = __add__
-
-    def __sub__(self, other):
-        return self.source - other
-
-    def __rsub__(self, other):
-        return other - self.source
+    __radd__ = __add__  # which counts before the other path's own sum
 
     def __getitem__(self, i):
         return self.source[i]
@@ -490,14 +476,19 @@ class PathAt(Path):
         return self.source.at_rate(factor, about)
 
 
-def path_at(path, numbers):
-    """A path with numbers of parameters by name: itself if it contains none."""
+def path_at(path, numbers, what="The path"):
+    """A path with numbers of parameters by name: itself if it contains none. `what` it is begins a message."""
     source = path.source if isinstance(path, PathAt) else path
     if not isinstance(source, ParametricPath):
         return path
-    made = source.made(numbers)
     said = f"with {', '.join(f'{name} = {numbers[name]:g}' for name in source.names)}"
+    made = source.made(numbers, f"{what} {said}")
     return PathAt(made.breaks, made.coefficients, made.classes, made.before, made.after, said, source)
+
+
+def numbers_in(symbols, values):
+    """The values (n_p,) of parameters by the names that these have in paths."""
+    return {symbol.name(): float(value) for symbol, value in zip(symbols, values, strict=False)}
 
 
 def parameters_of(path):
