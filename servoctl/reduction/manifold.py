@@ -354,8 +354,11 @@ def _random_starts(q, level, context):
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
     t = rng.uniform(*context.window, (2 * POINTS, 1))
     sizes = np.repeat(sizes_of_references(q, context.parameters, context.values), JETS + 1)
-    r = sizes * rng.uniform(-1.0, 1.0, (2 * POINTS, len(sizes)))
-    r = r if context.followed is None else np.tile(context.followed, (2 * POINTS, 1))
+    if context.followed is None:
+        middle = 0.0
+    else:
+        middle, sizes = context.followed, context.spread * (np.abs(context.followed) + SPREAD * sizes)
+    r = middle + sizes * rng.uniform(-1.0, 1.0, (2 * POINTS, len(sizes)))
     return np.hstack([t, r]).astype(REAL), z
 
 
