@@ -63,7 +63,7 @@ def strong_near(model, t, jets):
 
 
 def _near(base, place):
-    """The variant of a place (t, jets by name, their sizes), with its own parameters where the shared one is of no use."""
+    """The variant of a place (t, jets by name, their sizes), with own parameters where the shared one is of no use."""
     t, state, _ = place
     own = np.array_equal(base.parameters, base.reduction.context.values)
     with suppress(() if own else ServoError):
