@@ -50,8 +50,8 @@ def simulate_many(
     threads, where the equations are polynomials of the state and of sines and cosines that do not depend on time. Plans
     of programs that determine the motion completely run in compiled code and on threads as well, unless kinks or
     switches may lie on their way. All other motions, and those whose pivots fall, run one after the other, as
-    `simulate` computes them. The result of a case equals that of `simulate` to rounding, and depends neither on other
-    cases nor on threads.
+    `simulate` computes them. The result of a case equals that of `simulate` to rounding, whatever the other cases and
+    the threads.
 
     Parameters
     ----------
