@@ -409,7 +409,8 @@ def _solved(starting, flow, some, natural=False, aim=True):
 def aimed(lowest, instants, z):
     """Instants and jets after steps of q and of the references towards rows of order 0: any posture is some target."""
     nq, places = lowest.q.nq, np.arange(1, instants.shape[1], JETS + 1)
-    sizes = np.concatenate([lowest.points.sizes(0), np.ones(len(places))])[:, None]
+    of = lowest.points
+    sizes = np.concatenate([of.sizes(0), sizes_of_references(of.q, of.parameters, of.values)])[:, None]
     instants, z = instants.copy(), np.array(z, dtype=REAL)
     for _ in range(AIMING_STEPS):
         if (aim := lowest.aim(instants, z[:nq])) is None:
