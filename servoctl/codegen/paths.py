@@ -31,8 +31,8 @@ class Followed:
             pieces, _, size = path.coefficients.shape
             arrays = [np.ascontiguousarray(part) for part in (path.breaks, path.coefficients)]
             self._arrays += arrays  # which must live as long
-            rules = RULES[path.before], RULES[path.after]
-            rows.append((pieces, size, size, *rules, *(array.ctypes.data for array in arrays)))
+            places = (array.ctypes.data for array in arrays)
+            rows.append((pieces, size, size, RULES[path.before], RULES[path.after], *places))
         self._table = np.array(rows, dtype=np.int64)
         self.address, self._last = float(self._table.ctypes.data), (None, None)
         _alive[self.address] = self

@@ -39,8 +39,7 @@ def derived_near(model, t, jets, sizes=()):
     if key not in model._variants:
         base = model._variants[None]
         known = (near for near in tuple(base._functions.get(NEAR, {}).values()) if _serves(base, near, t, jets))
-        near = next(known, None)
-        near = _near(base, place) if near is None else base._with(near, near._functions, base._variants)
+        near = base._with(next(known, None) or _near(base, place), base._variants)
         if near.free != model.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {model.free}.",
@@ -63,18 +62,16 @@ def strong_near(model, t, jets):
 
 
 def _near(base, place):
-    """The variant of a place (t, jets by name, their sizes), with own parameters where the shared one is of no use."""
+    """The shared variant of a place (t, jets by name, their sizes); where it is of no use, that of own parameters."""
     t, state, _ = place
     own = np.array_equal(base.parameters, base.reduction.context.values)
     with suppress(() if own else ServoError):
         shared, key = base._functions.setdefault(NEAR, {}), repr(place)
         if key not in shared:
             _keep(shared, key, _derived(base, place, base.reduction.context.values))
-        near = shared[key]
-        if own or _serves(base, near, t, np.array([state[name] for name in base.jet_names])):
-            return base._with(near, near._functions, base._variants)
-    near = _derived(base, place, base.parameters)
-    return base._with(near, near._functions, base._variants)
+        if own or _serves(base, shared[key], t, np.array([state[name] for name in base.jet_names])):
+            return shared[key]
+    return _derived(base, place, base.parameters)
 
 
 def _derived(base, place, values):
@@ -85,7 +82,7 @@ def _derived(base, place, values):
 
 def _serves(base, near, t, jets):
     """Whether a variant that was derived near another state, or with other parameters, is as good at these jets."""
-    strong = pivot_strength(base._with(near, near._functions), t, jets) > STRONG
+    strong = pivot_strength(base._with(near), t, jets) > STRONG
     same = np.array_equal(base.parameters, near.reduction.context.values)
     return strong and near.free == base.free and (same or near._holds(base.parameters))
 
@@ -128,7 +125,7 @@ def variant_at(model, place):
     place = place or ()
     near, form = place[:3] if len(place) > 1 else (), place[-1] if len(place) % 3 == 1 else None
     if near:
-        model = _near(model._variants[None], tuple(near))
+        model = model._with(_near(model._variants[None], tuple(near)), model._variants)
     if form is None:
         return model
     return _formed(model, form if form == DIAGONAL else tuple((i, j) for i, j in form))

@@ -311,7 +311,10 @@ class _Many:
         for i in range(self.n):
             try:
                 (model,) = self.along([i])
-                breaks = tuple(path.timing for path in required_paths(model.paths).values())
+                breaks = tuple(
+                    (path.breaks.tobytes(), path.classes.tobytes(), path.before, path.after)
+                    for path in required_paths(model.paths).values()
+                )
                 if breaks not in known:
                     known[breaks] = breaks_within(model, span)
                 self.knots[i] = known[breaks]

@@ -72,11 +72,6 @@ class Path(Value):
         """The number of components."""
         return self.coefficients.shape[1]
 
-    @property
-    def timing(self):
-        """The breaks with their classes and the rules outside, in a form that can be compared."""
-        return self.breaks.tobytes(), self.classes.tobytes(), self.before, self.after
-
     def __call__(self, t):
         """The values at instants.
 
