@@ -80,11 +80,11 @@ def test_motions_from_one_start_derive_their_variants_once(monkeypatch):
 
     scene = gallery["spiral"]
     model = sv.derive(*scene.build())
-    start = model.start(guess=scene.guess, **scene.start)
     derived, places = Model._of, []
     monkeypatch.setattr(Model, "_of", lambda cls, *given: places.append(given[3]) or derived(*given))
+    start = model.start(guess=scene.guess, **scene.start)
     runs = [sv.simulate(model, start, scene.t_span, sv.methods.RungeKutta(4, step=1e-2)) for _ in range(2)]
-    assert len(places) == runs[0].counters["pivot_changes"] > 0
+    assert len(places) == 1 <= runs[0].counters["pivot_changes"]  # which the start has derived
     assert np.array_equal(*(run.jets for run in runs))
     assert runs[0].variants[-1][2] is runs[1].variants[-1][2]
     place = place_of(runs[0].variants[-1][2])

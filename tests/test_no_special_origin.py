@@ -152,12 +152,7 @@ SCENES = {  # scenes in plain coordinates, each through one change
 }  # fmt: skip
 
 
-REFUSED = {"crane-3d": "refused in millimetres: 'the order of a row changes', where it does not"}
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.xfail(reason=REFUSED[n])) if n in REFUSED else n for n in SCENES]
-)
+@pytest.mark.parametrize("name", SCENES)
 def test_scenes_need_the_same_forces_in_other_coordinates(name):
     scene = gallery[name]
     mechanism, program = scene.build()

@@ -26,13 +26,14 @@ class Followed:
 
     def __init__(self, paths):
         self.paths = tuple(paths)  # of one component each
-        self._table, self._arrays = np.zeros((len(self.paths), 9), dtype=np.int64), []
-        for row, path in zip(self._table, self.paths, strict=True):
+        rows, self._arrays = [], []
+        for path in self.paths:
             pieces, _, size = path.coefficients.shape
-            rules = RULES[path.before], RULES[path.after]
             arrays = [np.ascontiguousarray(part) for part in (path.breaks, path.coefficients)]
             self._arrays += arrays  # which must live as long
-            row[:] = pieces, size, size, *rules, *path.rests, *(array.ctypes.data for array in arrays)
+            places = (array.ctypes.data for array in arrays)
+            rows.append((pieces, size, size, RULES[path.before], RULES[path.after], *path.rests, *places))
+        self._table = np.array(rows, dtype=np.int64).reshape(-1, 9)
         self.address, self._last = float(self._table.ctypes.data), (None, None)
         _alive[self.address] = self
 

@@ -211,9 +211,9 @@ class Model(Detailed):
         """The model along paths of all references by name."""
         return Model(self.reduction, self._store, self.parameters, self._functions, paths=paths)
 
-    def _with(self, other, functions, variants=None):
+    def _with(self, other, variants=None):
         """The reduction of another model with the numbers and paths of this one."""
-        return Model(other.reduction, other._store, self.parameters, functions, variants, self.paths)
+        return Model(other.reduction, other._store, self.parameters, other._functions, variants, self.paths)
 
     @cached_property
     def _followed(self):

@@ -1,4 +1,10 @@
-"""The same model with other pivots: those of a state near by or of an instant, or the diagonal of definite matrices."""
+"""The same model with other pivots: those of a state near by or of an instant, or the diagonal of definite matrices.
+
+Variants near a state are shared by the models of other parameters and paths: one whose pivots are strong at another
+state serves there, too.
+"""
+
+from contextlib import suppress
 
 import numpy as np
 
@@ -12,7 +18,7 @@ from servoctl.spec.references import required_paths
 from servoctl.tolerances import ENTRY, RESOLVED
 
 DIAGONAL = "diagonal"  # pivots of definite matrices, beside places of other pivots
-AS_DERIVED = "as derived"  # a model with the parameters at which its ranks were decided
+NEAR = "near"  # variants near states, derived with the parameters at which ranks were decided
 STRONG = 0.1  # of its usual size: pivots above this serve for other parameters, or again
 MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the same ones again
 
@@ -30,19 +36,21 @@ def derived_near(model, t, jets, sizes=()):
     state = dict(zip(model.jet_names, jets.tolist(), strict=True)) | references_at(required_paths(model.paths), t)
     place = (float(t), state, default | sizes)
     key = repr(place)
-    if key in model._variants:
-        return model._variants[key]
-    near = _near_before(model, t, jets, sizes) or _near(model, place)
-    if near.free != model.free:
-        raise SpecificationError(
-            f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {model.free}.",
-            "The number of free initial values is the same along a motion.",
-            do="Derive two models, one for each regime.",
-            t=float(t),
-            free=near.free,
-            expected=model.free,
-        )
-    return _kept(model, key, model._with(near, near._functions, model._variants))
+    if key not in model._variants:
+        base = model._variants[None]
+        known = (near for near in tuple(base._functions.get(NEAR, {}).values()) if _serves(base, near, t, jets))
+        near = base._with(next(known, None) or _near(base, place), base._variants)
+        if near.free != model.free:
+            raise SpecificationError(
+                f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {model.free}.",
+                "The number of free initial values is the same along a motion.",
+                do="Derive two models, one for each regime.",
+                t=float(t),
+                free=near.free,
+                expected=model.free,
+            )
+        _keep(model._variants, key, near)
+    return model._variants[key]
 
 
 def strong_near(model, t, jets):
@@ -53,29 +61,30 @@ def strong_near(model, t, jets):
         return model
 
 
-def _near(model, place):
-    r = model.reduction
-    guess = None if r.context.scales is None else model._store.specification[2] or {}
-    return model._of(r.mechanism, r.program, guess, place, model.parameters)
+def _near(base, place):
+    """The shared variant of a place (t, jets by name, their sizes); where it is of no use, that of own parameters."""
+    t, state, _ = place
+    own = np.array_equal(base.parameters, base.reduction.context.values)
+    with suppress(() if own else ServoError):
+        shared, key = base._functions.setdefault(NEAR, {}), repr(place)
+        if key not in shared:
+            _keep(shared, key, _derived(base, place, base.reduction.context.values))
+        if own or _serves(base, shared[key], t, np.array([state[name] for name in base.jet_names])):
+            return shared[key]
+    return _derived(base, place, base.parameters)
 
 
-def _near_before(model, t, jets, sizes):
-    """The variant near an instant with the parameters of the derivation, if it serves with these; else None."""
-    r = model.reduction
-    if model.paths:  # a variant belongs to the jets of its paths
-        return None
-    same = np.array_equal(model.parameters, r.context.values)
-    own = model if same else type(model)(r, model._store, functions=model._functions)
-    first = model._functions.setdefault(AS_DERIVED, own)
-    if first is model:
-        return None
-    try:
-        near = derived_near(first, t, jets, sizes)
-    except ServoError:
-        return None
-    here = model._with(near, near._functions)
-    serves = pivot_strength(here, t, jets) > STRONG and (same or near._holds(model.parameters))
-    return here if serves else None
+def _derived(base, place, values):
+    r = base.reduction
+    guess = None if r.context.scales is None else base._store.specification[2] or {}
+    return base._of(r.mechanism, r.program, guess, place, values)
+
+
+def _serves(base, near, t, jets):
+    """Whether a variant that was derived near another state, or with other parameters, is as good at these jets."""
+    strong = pivot_strength(base._with(near), t, jets) > STRONG
+    same = np.array_equal(base.parameters, near.reduction.context.values)
+    return strong and near.free == base.free and (same or near._holds(base.parameters))
 
 
 def with_diagonal_pivots(model):
@@ -116,8 +125,7 @@ def variant_at(model, place):
     place = place or ()
     near, form = place[:3] if len(place) > 1 else (), place[-1] if len(place) % 3 == 1 else None
     if near:
-        t, jets, sizes = near
-        model = derived_near(model, t, [jets[name] for name in model.jet_names], sizes)
+        model = model._with(_near(model._variants[None], tuple(near)), model._variants)
     if form is None:
         return model
     return _formed(model, form if form == DIAGONAL else tuple((i, j) for i, j in form))
@@ -132,12 +140,12 @@ def _formed(model, form):
     store, functions = model._store.part(form), model._functions.setdefault(str(form), {})
     numbers = model.parameters, functions, model._variants, model.paths
     made = reduction and type(model)(reduction, store, *numbers)
-    return _kept(model, key, made)
+    return _keep(model._variants, key, made)
 
 
-def _kept(model, key, variant):
-    """A variant that is held from now on, in place of the oldest one where there are too many."""
-    if len(model._variants) > MOST_VARIANTS:
-        del model._variants[next(known for known in model._variants if known is not None)]
-    model._variants[key] = variant
+def _keep(variants, key, variant):
+    """The variant, which is held from now on, in place of the oldest one where there are too many."""
+    if len(variants) > MOST_VARIANTS:
+        del variants[next(known for known in variants if known is not None)]
+    variants[key] = variant
     return variant

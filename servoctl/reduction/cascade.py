@@ -115,7 +115,7 @@ class Cascade:
         points, order = replace(points, z=self.continued(points, level, given)[0]), []
         for block in self.blocks:
             leading = block.leading(self.q)
-            pivots = pivot_order(leading, clean(*points.matrix(leading)))
+            pivots = pivot_order(leading, clean(*points.matrix(leading)), sieved=False)
             order += [(block.places[i], block.columns[j]) for i, j in pivots]
         return tuple(order)
 

@@ -28,7 +28,7 @@ GAUSS_NEWTON_STEPS = 60  # on all levels together
 COORDINATE_STEPS, JET_STEPS = 8, 2  # Newton steps for q, and for a level of jets, where rows are mostly affine
 LEVEL_SWEEPS = 2  # a second one, without gradients in all jets, where the first leaves the rounding of its steps
 AIMING_STEPS = 6  # Gauss-Newton steps of q and references together, before the levels
-SHORTENINGS = 12  # quarterings of a step before the search from a start ends
+SHORTENINGS = 3  # quarterings of a step before a search ends: with shorter steps it creeps, and other starts converge
 SPREAD = 0.1  # relative width of starts about a guess, whose size is its value plus its usual size
 POINTS = 5  # at which ranks are decided; with as many further starts where one of the first fails
 POINTS_SEED = 1907  # of the random starts
@@ -297,27 +297,24 @@ def sample(q, rows, level, context, starts=None, flow=None):
     At most `POINTS`; none if no start converges. Starts are random, by the window and the guess of the context, beside
     the jets of earlier points `starts`. A `flow`, if given, has the same rows and level.
     """
-    t, z = _random_starts(q, level, context)
+    starting = anywhere(q, level, context)
     if starts is not None and len(starts):
+        t, z = starting.instants, starting.z
         shared = min(len(z), len(starts.z))
         for i in range(POINTS):
             again, p = divmod(i, len(starts))
             t[i, : starts.instants.shape[1]] = starts.instants[p]  # references that were made later have random jets
             z[:shared, i] = starts.z[:shared, p] + again * SPREAD * z[:shared, i]
-    starting = Points(
-        q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book, context.scales
-    )
     flow = flow.at(starting) if flow else Flow(q, rows, level, starting)
-    aim = context.followed is None
-    first = _solved(starting, flow, slice(POINTS), aim=aim)
+    first = _solved(starting, flow, slice(POINTS))
     points = _with_inertia(first, context.saddle)
     if len(points) == POINTS:
         return points
-    others = _solved(starting, flow, slice(POINTS, None), aim=aim)
+    others = _solved(starting, flow, slice(POINTS, None))
     points = points.joined(_with_inertia(others, context.saddle)).take(slice(POINTS))
     if not len(points):  # as where every solution is in such a place
         points = first.joined(others).take(slice(POINTS))
-    return points if len(points) else _solved(starting, flow, slice(POINTS), natural=True, aim=aim)
+    return points if len(points) else _solved(starting, flow, slice(POINTS), natural=True)
 
 
 def _with_inertia(points, saddle):
@@ -335,7 +332,8 @@ def _with_inertia(points, saddle):
 def anywhere(q, level, context):
     """The random points about the guess from which points of a manifold are sought."""
     t, z = _random_starts(q, level, context)
-    return Points(q, t, z.astype(REAL), context.parameters, context.values, np.zeros(len(t)), context.book)
+    known = context.parameters, context.values
+    return Points(q, t, z.astype(REAL), *known, np.zeros(len(t)), context.book, context.scales)
 
 
 def _random_starts(q, level, context):
@@ -353,8 +351,9 @@ def _random_starts(q, level, context):
     z = centre[:, None] + spread[:, None] * rng.uniform(-1.0, 1.0, (nz, 2 * POINTS))
     t = rng.uniform(*context.window, (2 * POINTS, 1))
     sizes = np.repeat(sizes_of_references(q, context.parameters, context.values), JETS + 1)
-    r = sizes * rng.uniform(-1.0, 1.0, (2 * POINTS, len(sizes)))
-    r = r if context.followed is None else np.tile(context.followed, (2 * POINTS, 1))
+    near = context.followed
+    middle, sizes = (0.0, sizes) if near is None else (near, context.spread * (np.abs(near) + SPREAD * sizes))
+    r = middle + sizes * rng.uniform(-1.0, 1.0, (2 * POINTS, len(sizes)))
     return np.hstack([t, r]).astype(REAL), z
 
 
@@ -375,11 +374,8 @@ def sizes_of_references(q, parameters, values):
 
 def follows(q, values):
     """Jets (R,) of references, as in instants, by their values {"X_reference": ...}; those without are zero."""
-    jets = np.zeros((len(q.family), JETS + 1))
-    for i, name in enumerate(q.family.names):
-        for k in range(JETS + 1):
-            jets[i, k] = values.get(jet_of_reference(name, k), 0.0) / factorial(k)
-    return jets.ravel()
+    jets = ((name, k) for name in q.family.names for k in range(JETS + 1))
+    return np.array([values.get(jet_of_reference(name, k), 0.0) / factorial(k) for name, k in jets])
 
 
 def references_at(paths, t):
@@ -396,10 +392,10 @@ def jet_of_reference(name, k):
     return f"d{k}{name}_reference"
 
 
-def _solved(starting, flow, some, natural=False, aim=True):
+def _solved(starting, flow, some, natural=False):
     """The points of the manifold to which Newton's method converges from some of the starting points."""
     instants, z = starting.instants[some], starting.z[:, some]
-    if aim and 0 in flow.members:
+    if 0 in flow.members:
         instants, z = aimed(flow.lowest, instants, z)
     z, residual = solve(flow, instants, z, natural=natural)
     points = replace(starting, instants=instants, z=z, residual=residual.astype(float))
@@ -408,8 +404,8 @@ def _solved(starting, flow, some, natural=False, aim=True):
 
 def aimed(lowest, instants, z):
     """Instants and jets after steps of q and of the references towards rows of order 0: any posture is some target."""
-    nq, places = lowest.q.nq, np.arange(1, instants.shape[1], JETS + 1)
-    sizes = np.concatenate([lowest.points.sizes(0), np.ones(len(places))])[:, None]
+    q, nq, points, places = lowest.q, lowest.q.nq, lowest.points, np.arange(1, instants.shape[1], JETS + 1)
+    sizes = np.concatenate([points.sizes(0), sizes_of_references(q, points.parameters, points.values)])[:, None]
     instants, z = instants.copy(), np.array(z, dtype=REAL)
     for _ in range(AIMING_STEPS):
         if (aim := lowest.aim(instants, z[:nq])) is None:

@@ -197,10 +197,13 @@ def _difference(a, b):
     return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)
 
 
-def pivot_order(matrix, numbers):
-    """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points."""
+def pivot_order(matrix, numbers, sieved=True):
+    """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points.
+
+    Unless `sieved`, what vanishes identically counts as fill-in: to find it takes most of the time.
+    """
     n = matrix.shape[0]
-    system = _System(matrix, ca.SX(n, 0), numbers)
+    system = _System(matrix, ca.SX(n, 0), numbers, sieved=sieved)
     with np.errstate(all="ignore"):
         return tuple(system.step() for _ in range(n))
 
@@ -231,15 +234,15 @@ class _System:
     """A system under elimination.
 
     `rows` has for each row its entries by column: an SX scalar, and its equilibrated numbers at the points where pivots
-    are chosen. What is zero at all of them is left out if it vanishes identically. `candidates` are the columns whose
-    entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
+    are chosen. If `sieved`, what is zero at all of them is left out if it vanishes identically. `candidates` are the
+    columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
     """
 
-    def __init__(self, matrix, right, numbers, diagonal=False, in_order=False):
-        n, self.diagonal, self.in_order = matrix.shape[0], diagonal, in_order
+    def __init__(self, matrix, right, numbers, diagonal=False, in_order=False, sieved=True):
+        n, self.diagonal, self.in_order, self.sieved = matrix.shape[0], diagonal, in_order, sieved
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
-        doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
+        doubtful = [(i, j, entry) for i, j, entry in entries if sieved and not scaled[i, j].any()]
         vanishing = identical_zeros([entry for _, _, entry in doubtful])
         zeros = {(i, j) for (i, j, _), zero in zip(doubtful, vanishing, strict=True) if zero}
         self.rows = [{} for _ in range(n)]
@@ -312,7 +315,7 @@ class _System:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
             left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
-            if not numbers.any() and identical_zeros([left])[0]:
+            if self.sieved and not numbers.any() and identical_zeros([left])[0]:
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:

@@ -142,7 +142,7 @@ class Reduction(Packed):
         here = self.points.at(t, jets[:, None], values)
         if self.cascade is not None:
             return self.cascade.order_at(here, self.top - 1 if self.free else 0, self.top)
-        return pivot_order(self.leading, clean(*here.matrix(self.leading)))
+        return pivot_order(self.leading, clean(*here.matrix(self.leading)), sieved=False)
 
     def with_order(self, order):
         """The reduction with other pivots, as `order_at` chooses them."""

@@ -23,7 +23,7 @@ from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
 from servoctl.spec.paths.value import Path, PathAt
-from servoctl.spec.references import followed_path, paths_at
+from servoctl.spec.references import followed_path, paths_at, required_paths
 from servoctl.study.batch import FINAL, Batch, failure, of_finished
 from servoctl.study.cases import as_columns
 from servoctl.study.executor import computed, require_some, whole_run
@@ -50,8 +50,8 @@ def simulate_many(
     threads, where the equations are polynomials of the state and of sines and cosines that do not depend on time. Plans
     of programs that determine the motion completely run in compiled code and on threads as well, unless kinks or
     switches may lie on their way. All other motions, and those whose pivots fall, run one after the other, as
-    `simulate` computes them. The result of a case equals that of `simulate` to rounding, and depends neither on other
-    cases nor on threads.
+    `simulate` computes them. The result of a case equals that of `simulate` to rounding, whatever the other cases and
+    the threads.
 
     Parameters
     ----------
@@ -312,10 +312,17 @@ class _Many:
 
     def _smooth(self, span):
         """Cases (N,) whose paths are smooth enough within a span, whose knots are kept; other cases become errors."""
-        smooth, self.knots = np.ones(self.n, bool), [()] * self.n
+        smooth, self.knots, known = np.ones(self.n, bool), [()] * self.n, {}
         for i in range(self.n):
             try:
-                self.knots[i] = breaks_within(*self.along([i]), span)
+                (model,) = self.along([i])
+                breaks = tuple(
+                    (path.breaks.tobytes(), path.classes.tobytes(), path.before, path.after)
+                    for path in required_paths(model.paths).values()
+                )
+                if breaks not in known:
+                    known[breaks] = breaks_within(model, span)
+                self.knots[i] = known[breaks]
             except ServoError:
                 smooth[i] = False
         return smooth
