@@ -328,6 +328,8 @@ class Run(Sampled, Value):
         SpecificationError
             If t lies outside the run.
         """
+        if np.ndim(t):
+            return self._at_all(np.asarray(t, dtype=float))
         t = finite("t", t, "time")
         low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
         if not low - SAME_TIME * (1 + abs(low)) <= t <= high + SAME_TIME * (1 + abs(high)):
@@ -345,6 +347,64 @@ class Run(Sampled, Value):
         step = 1 if (t > self.t[i]) == (self.t[-1] > self.t[0]) else -1
         j = min(max(i + step, 0), len(self.t) - 1)
         return self._hermite(t, *sorted((i, j), key=lambda k: self.t[k]))
+
+    # shim: `span`, `at` of an array and `by_model` until a run keeps its steps
+
+    @property
+    def span(self):
+        """The first and the last instant of the motion [s]."""
+        first = self.t[0] if self.start is None else self.start.t
+        return first, self.t[-1]
+
+    def by_model(self, t):
+        """(model, whether it holds at instants t (N,)) for each model of the run."""
+        forward = np.sign(self.span[1] - self.span[0]) or 1.0
+        samples = np.searchsorted(forward * self.t, forward * t - SAME_TIME * (1 + np.abs(self.span).max()))
+        samples = np.minimum(samples, len(self.t) - 1)
+        for first, end, model in self.variants or ((0, len(self.t), self.model),):
+            inside = (samples >= first) & (samples < end)
+            if inside.any():
+                yield model, inside
+
+    def _at_all(self, t):
+        """Jets (n_z, N): of dense samples by Hermite's polynomials, else integrated from one sample to the next."""
+        if len(self.t) > 256 and self.t[0] == self.span[0]:
+            return self._all_by_hermite(t)
+        n_x, jets = len(self.model.state_names), np.full((len(self.jets), len(t)), np.nan)
+        for model, inside in self.by_model(t):
+            jets[:n_x, inside] = self._integrated(model, t[inside])
+        return jets
+
+    def _integrated(self, model, t):
+        from scipy.integrate import solve_ivp
+
+        f, n_x, x = model.function("ode"), len(model.state_names), np.empty((len(model.state_names), len(t)))
+        forward = np.sign(self.span[1] - self.span[0]) or 1.0
+        starts, states = self.t, self.jets[:n_x]
+        if starts[0] != self.span[0]:
+            starts, states = np.append(self.span[0], starts), np.column_stack([self.start.values, states])
+        k = np.maximum(np.searchsorted(forward * starts, forward * t, side="right") - 1, 0)
+        for i in np.unique(k):
+            at = k == i
+            if (t[at] == starts[i]).all():
+                x[:, at] = states[:, [i]]
+                continue
+            rates, span = (lambda s, y: f(s, y, model.p)[:n_x]), (starts[i], t[at][-1])
+            way = solve_ivp(rates, span, states[:, i], "LSODA", rtol=1e-10, atol=1e-12, dense_output=True)
+            x[:, at] = way.sol(t[at])
+        return x
+
+    def _all_by_hermite(self, t):
+        nq, n = self.model.nq, self.model.n
+        forward = np.sign(self.t[-1] - self.t[0]) or 1.0
+        i = np.clip(np.searchsorted(forward * self.t, forward * t, side="right") - 1, 0, len(self.t) - 2)
+        h, top = self.t[i + 1] - self.t[i], (len(self.jets) - nq) // n
+        s, jets = (t - self.t[i]) / h, self.jets
+        levels = [jets[nq + k * n : nq + (k + 1) * n] for k in range(top)]
+        plain = "coordinate_rates" not in signal_groups(self.model.reduction).values()
+        rates = levels if plain else self._coordinate_rates(slice(None))
+        q = _hermite_between([jets[:nq], *rates], i, s, h)
+        return np.concatenate([q[0], *(_hermite_between(levels, i, s, h) if not plain else q[1:])])[: len(jets)]
 
     def _hermite(self, t, i, j):
         from scipy.interpolate import BPoly
@@ -510,6 +570,20 @@ def range_in_words(name, low, t_low, high, t_high, unit):
     low, high = (f"{digits(value)} {unit}".rstrip() for value in (low, high))
     at_low, at_high = ("" if np.isnan(t) else f" (t = {t:.4g} s)" for t in (t_low, t_high))
     return f"  {name}: {low} throughout" if low == high else f"  {name}: {low}{at_low} .. {high}{at_high}"
+
+
+def _hermite_between(levels, i, s, h):
+    """Values and derivatives at s (N,) within intervals i of lengths h (N,), of values with derivatives at samples."""
+    from math import factorial
+
+    count = len(levels)
+    powers = np.arange(2 * count)
+    derivative = np.array([[factorial(p) / factorial(p - k) if p >= k else 0.0 for p in powers] for k in range(count)])
+    at = lambda s, k: derivative[k] * np.power.outer(s, np.maximum(powers - k, 0))
+    system = np.array([*(at(0.0, k) for k in range(count)), *(at(1.0, k) for k in range(count))])
+    ends = [level[:, j] * h**k for j in (i, i + 1) for k, level in enumerate(levels)]
+    c = np.tensordot(np.linalg.inv(system), np.stack(ends), 1)  # (2 count, n, N)
+    return [np.einsum("Np,pnN->nN", at(s, k), c) / h**k for k in range(count)]
 
 
 class _Residuals(Mapping):
