@@ -402,9 +402,9 @@ class Run(Sampled, Value):
         s, jets = (t - self.t[i]) / h, self.jets
         levels = [jets[nq + k * n : nq + (k + 1) * n] for k in range(top)]
         plain = "coordinate_rates" not in signal_groups(self.model.reduction).values()
-        rates = levels if plain else self._coordinate_rates(slice(None))
-        q = _hermite_between([jets[:nq], *rates], i, s, h)
-        return np.concatenate([q[0], *(_hermite_between(levels, i, s, h) if not plain else q[1:])])[: len(jets)]
+        of_q = [jets[:nq], *(levels if plain else self._coordinate_rates(slice(None)))]
+        all_levels = [of_q, *(levels[k:] for k in range(top))]
+        return np.concatenate([_hermite_between(some[:3], i, s, h) for some in all_levels])
 
     def _hermite(self, t, i, j):
         from scipy.interpolate import BPoly
@@ -573,17 +573,20 @@ def range_in_words(name, low, t_low, high, t_high, unit):
 
 
 def _hermite_between(levels, i, s, h):
-    """Values and derivatives at s (N,) within intervals i of lengths h (N,), of values with derivatives at samples."""
+    """Values at s (N,) within intervals i of lengths h (N,), of values with derivatives at samples."""
     from math import factorial
 
     count = len(levels)
     powers = np.arange(2 * count)
     derivative = np.array([[factorial(p) / factorial(p - k) if p >= k else 0.0 for p in powers] for k in range(count)])
-    at = lambda s, k: derivative[k] * np.power.outer(s, np.maximum(powers - k, 0))
+
+    def at(s, k):
+        return derivative[k] * np.power.outer(s, np.maximum(powers - k, 0))
+
     system = np.array([*(at(0.0, k) for k in range(count)), *(at(1.0, k) for k in range(count))])
     ends = [level[:, j] * h**k for j in (i, i + 1) for k, level in enumerate(levels)]
     c = np.tensordot(np.linalg.inv(system), np.stack(ends), 1)  # (2 count, n, N)
-    return [np.einsum("Np,pnN->nN", at(s, k), c) / h**k for k in range(count)]
+    return np.einsum("Np,pnN->nN", at(s, 0), c)
 
 
 class _Residuals(Mapping):
