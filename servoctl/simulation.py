@@ -237,13 +237,15 @@ def judged(run, tolerance=STEP_ERROR):
     Most motions need no propagators to know that there is nothing to warn of: a bound of the growth tells. Whoever
     interrupts a motion does not wait. `tolerance` is the relative error of a step of the run's method.
     """
-    known = run.with_verdict(partial(_verdict, tolerance=tolerance))
+    later = run.with_verdict(partial(_verdict, tolerance=tolerance))
     try:
-        quiet = not run.success or growth_bound(run.model, run) <= UNSTABLE
-        if not quiet and known.internal["verdict"] == "unstable":
-            warn_unstable(known.internal["text"])
+        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+            return later
+        known = later.with_verdict(dict(later.internal))
     except KeyboardInterrupt:
-        return _interrupted_at_its_end(known)
+        return _interrupted_at_its_end(later)
+    if known.internal["verdict"] == "unstable":
+        warn_unstable(known.internal["text"])
     return known
 
 

@@ -3,7 +3,6 @@
 import pickle
 import runpy
 import warnings
-from dataclasses import replace
 from math import pi
 from pathlib import Path
 
@@ -357,13 +356,12 @@ def test_a_stopped_motion_carries_the_verdict_too():
     assert caught.value.run.internal["verdict"] == "unstable"
 
 
-def test_samples_that_resolve_nothing_are_inconclusive():
-    model = passive(mathieu(0.6))
-    run, _ = moved(model, 120.0)
-    jets = run.jets.copy()
-    jets[:, ::2] *= 1.5  # no motion
-    found = sv.internal_dynamics(replace(run, jets=jets))
-    assert found.verdict == "inconclusive" and np.isnan(found.growth) and "t_eval" in repr(found)
+def test_what_swings_too_often_is_inconclusive():
+    """Along a thousand periods of the linearisation, two instants in each tell nothing."""
+    run, found = moved(passive(lambda x, v, t: -0.1 * v - (1 + 200 * ca.cos(50 * t)) * x), 120.0)
+    assert found.verdict == run.internal["verdict"] == "inconclusive" and np.isnan(found.growth)
+    assert "2048 intervals" in repr(found) and "a shorter time" in repr(found)
+    assert sv.internal_dynamics(moved(run.model, 5.0)[0]).verdict != "inconclusive"
 
 
 # the bound that settles whether there is anything to warn of ----------------------------------------------------------
