@@ -33,9 +33,10 @@ EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λ
 MOST_GROWTH = 0.8  # of the logarithm of all growth: what is exponential has it, not one swing that is followed by drift
 GREAT = 1e4  # growth that is unstable even if it is a power of time
 SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
-INTERVALS = 512, 2048  # of a motion, at whose ends it is linearised: the second where the first do not resolve it
+INTERVALS, MOST = 512, 2048  # of a motion, at whose ends it is linearised; where the first do not resolve its growth
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
+BESIDE = 1e-10  # of the span and of the instant: distance on both sides of a knot, where the linearisation may jump
 TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
@@ -86,7 +87,7 @@ class InternalDynamics(Shown):
     until: np.ndarray = field(default_factory=lambda: np.ones((2, 0)))
     period: float = 0.0
     multipliers: np.ndarray = field(default_factory=lambda: np.zeros(0, complex))
-    cause: str = f"{INTERVALS[-1]} intervals do not resolve it; simulate a shorter time"
+    cause: str = f"{MOST} intervals do not resolve it; simulate a shorter time"
 
     @property
     def t(self):
@@ -244,11 +245,11 @@ def growth_bound(model, run):
     t0, t1 = run.span
     if t0 == t1:
         return np.inf
-    t = t0 + (t1 - t0) * _irregular(LOOKS)
+    t = _instants(run, t1, LOOKS)
     x = run.at(t)[: len(model.state_names)]
     if not np.isfinite(x).all():
         return np.inf
-    picked = _spread(t, x / _sizes(x)[:, None])
+    picked = _spread(t, x / _sizes(x)[:, None], _knots(run, t1))
     tangents = _linearised(run, t[picked], x[:, picked], _sizes(x))
     t, N, JN = np.abs(tangents.t - t0), tangents.N, tangents.JN
     if len(t) < len(picked):
@@ -262,13 +263,19 @@ def growth_bound(model, run):
     return float(np.exp(fine + abs(fine - coarse)))
 
 
-def _spread(t, x):
-    """BOUNDED_AT + 1 samples at equal parts of the time and of the way of the states x (n_x, N), first and last too."""
+def _spread(t, x, knots):
+    """BOUNDED_AT + 1 samples at equal parts of the time and of the way of the states x (n_x, N), first and last too.
+
+    Where none is between two knots, all that are there.
+    """
     way, time = np.abs(np.diff(x)).sum(axis=0), np.abs(np.diff(t))
     part = np.cumsum(time / time.sum() + way / max(way.sum(), TINY))
     samples = np.searchsorted(part, np.linspace(0.0, part[-1], BOUNDED_AT + 1))
     samples[-1] = len(part)
-    return samples
+    if not len(knots):
+        return samples
+    pieces = np.searchsorted(np.abs(knots - t[0]), np.abs(t - t[0]))
+    return np.union1d(samples, np.flatnonzero(~np.isin(pieces, pieces[samples])))
 
 
 def _largest_integral(t, mu):
@@ -397,14 +404,20 @@ def _grid(interpreter, t, x, p):
 # --- instants ---------------------------------------------------------------------------------------------------------
 
 
+def _knots(run, t1):
+    """Knots (K,) within a run up to t1, in its direction."""
+    return np.array(breakpoints((run.span[0], t1), run.knots)[1:-1])
+
+
 def _instants(run, t1, count):
-    """Ends of `count` intervals of a run up to t1, or more: of four at least from a knot to the next.
+    """Ends of `count` intervals of a run up to t1, or more: of four at least from a knot to the next, and around it.
 
     Instants at equal distances would see a periodic linearisation at one phase only. They are closer together towards
     the end of a motion that stopped, where its rates may have no bound.
     """
-    t0 = run.span[0]
-    ends = np.array(breakpoints((t0, t1), run.knots))
+    t0, knots = run.span[0], _knots(run, t1)
+    beside = BESIDE * (np.abs(knots) + abs(t1 - t0)) * np.sign(t1 - t0)
+    ends = np.concatenate([[t0], np.column_stack([knots - beside, knots + beside]).ravel(), [t1]])
     shares = np.abs(np.diff(ends)) / (abs(t1 - t0) or 1.0)
     parts = [_irregular(4 * max(1, round(count / 4 * share))) for share in shares]
     if run.status < 0:
@@ -423,7 +436,7 @@ def _irregular(count):
 
 def _propagated(model, run, t1):
     """Tangents along a run up to t1, and, if enough to resolve the growth, steps along them and propagators."""
-    for count in INTERVALS:
+    for count in (INTERVALS, MOST):
         tangents = _tangents(model, run, _instants(run, t1, count)).in_fours()
         steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
         if steps is None or longer is None:

@@ -188,6 +188,21 @@ def test_exponential_growth_is_unstable_above_ten(growth, verdict):
     assert found.verdict == verdict and found.growth == pytest.approx(growth, rel=0.03)
 
 
+@pytest.mark.parametrize("width", [1e-2, 1e-3, 1e-5])
+@pytest.mark.parametrize("x", [1.0, 0.0])
+def test_what_grows_within_a_pulse_of_a_path_is_unstable(width, x):
+    """By λ sinh(λ width) of a speed at λ = 3/width, also where the body itself stays at rest."""
+    q = sv.coordinates("x y")
+    rate = 3 / width
+    pulse = q.references(pulse=sv.paths.polynomials([0.0, 0.4, 0.4 + width, 1.0], [[0.0, rate**2, 0.0]])).pulse
+    accelerations = sum(a**2 for a in q.d(2)) / 2
+    mechanism = sv.Mechanism(q, gibbs=accelerations, forces={"x": (pulse - 1) * q["x"]}, actuators={"F": q["y"]})
+    model = sv.derive(mechanism, sv.Program({"y": q["y"] - ca.sin(q.t)}, jumps=True), keep=["x"])
+    with warned("Internal dynamics unstable"):
+        run = sv.simulate(model, model.start(x=x, dx=0.0), (0.0, 1.0))
+    assert run.internal["growth"] == pytest.approx(rate * np.sinh(3), rel=0.1)
+
+
 def test_a_pole_that_falls_is_unstable_over_any_longer_time():
     """On a cart that moves by a metre; errors grow twentyfold while it falls, and no more when it swings below."""
     q = sv.coordinates("x theta")
