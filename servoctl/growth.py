@@ -33,7 +33,7 @@ EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λ
 MOST_GROWTH = 0.8  # of the logarithm of all growth: what is exponential has it, not one swing that is followed by drift
 GREAT = 1e4  # growth that is unstable even if it is a power of time
 SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
-INTERVALS, MOST = 512, 2048  # of a motion, at whose ends it is linearised; where the first do not resolve its growth
+INTERVALS, MOST = 512, 2048  # at whose ends a motion is linearised, at first and where these do not resolve the growth
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
 BESIDE = 1e-10  # of the span and of the instant: distance on both sides of a knot, where the linearisation may jump
@@ -215,8 +215,8 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
 
     Notes
     -----
-    The motion is linearised at the ends of 512 intervals or a few more, with ends at breaks of paths, whatever its
-    samples. The growth counts if that by intervals twice as long agrees; otherwise 2048 intervals are tried.
+    The motion is linearised at the ends of 512 intervals or a few more, on both sides of breaks of its paths, whatever
+    its samples. The growth counts if that by intervals twice as long agrees; otherwise 2048 intervals are tried.
     """
     model = require_run(run, "internal_dynamics")
     if model.flat:
