@@ -33,15 +33,15 @@ EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λ
 MOST_GROWTH = 0.8  # of the logarithm of all growth: what is exponential has it, not one swing that is followed by drift
 GREAT = 1e4  # growth that is unstable even if it is a power of time
 SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
-INTERVALS, MOST = 512, 2048  # at whose ends a motion is linearised, at first and where these do not resolve the growth
+FEWEST, MOST = 512, 2048  # at whose ends a motion is linearised, at first and where these do not resolve the growth
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
-BESIDE = 1e-10  # of the span and of the instant: distance on both sides of a knot, where the linearisation may jump
+ASIDE = 1e-10  # of the span and of the instant: distance on both sides of a knot, where the linearisation may jump
 TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
-LOOKS = 128  # intervals by which these instants are spread over the way of the states
+GLANCES = 128  # intervals by which these instants are spread over the way of the states
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
@@ -245,7 +245,7 @@ def growth_bound(model, run):
     t0, t1 = run.span
     if t0 == t1:
         return np.inf
-    t = _instants(run, t1, LOOKS)
+    t = _instants(run, t1, GLANCES)
     x = run.at(t)[: len(model.state_names)]
     if not np.isfinite(x).all():
         return np.inf
@@ -416,7 +416,7 @@ def _instants(run, t1, count):
     the end of a motion that stopped, where its rates may have no bound.
     """
     t0, knots = run.span[0], _knots(run, t1)
-    beside = BESIDE * (np.abs(knots) + abs(t1 - t0)) * np.sign(t1 - t0)
+    beside = ASIDE * (np.abs(knots) + abs(t1 - t0)) * np.sign(t1 - t0)
     ends = np.concatenate([[t0], np.column_stack([knots - beside, knots + beside]).ravel(), [t1]])
     shares = np.abs(np.diff(ends)) / (abs(t1 - t0) or 1.0)
     parts = [_irregular(4 * max(1, round(count / 4 * share))) for share in shares]
@@ -436,7 +436,7 @@ def _irregular(count):
 
 def _propagated(model, run, t1):
     """Tangents along a run up to t1, and, if enough to resolve the growth, steps along them and propagators."""
-    for count in (INTERVALS, MOST):
+    for count in (FEWEST, MOST):
         tangents = _tangents(model, run, _instants(run, t1, count)).in_fours()
         steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
         if steps is None or longer is None:
