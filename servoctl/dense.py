@@ -1,6 +1,7 @@
 """A motion between its samples: the dense output of its steps, and the extremes of a signal along them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import factorial, perm
 
 import numpy as np
@@ -128,6 +129,18 @@ def piece_of(pieces, t):
     forward = 1.0 if pieces[-1].t[-1] >= pieces[0].t[0] else -1.0
     ends = np.array([piece.t[-1] for piece in pieces])
     return np.minimum(np.searchsorted(forward * ends, forward * t), len(pieces) - 1)
+
+
+def up_to(pieces, t):
+    """The pieces up to an instant [s], where a motion must end."""
+    forward, result = 1.0 if pieces and pieces[-1].t[-1] >= pieces[0].t[0] else -1.0, []
+    for piece in pieces:
+        before = piece.t[forward * piece.t < forward * t]
+        if len(before) == len(piece.t):
+            result.append(piece)
+        elif len(before):
+            result.append(replace(piece, t=np.append(before, t)))
+    return result
 
 
 def jets_at(pieces, t):

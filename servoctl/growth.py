@@ -18,15 +18,13 @@ import numpy as np
 from servoctl.checks import positive
 from servoctl.errors import SpecificationError
 from servoctl.markup import Shown
-from servoctl.methods import flow
 from servoctl.methods.kinks import SMOOTHER, stays_on_switch
 from servoctl.methods.motion import breakpoints
 from servoctl.methods.stability import stability_function
 from servoctl.model.equations import invariant_names
-from servoctl.model.switching import switching
 from servoctl.run import SAME_TIME, Run, require_run
 from servoctl.tolerances import TINY
-from servoctl.values import evenly, frozen
+from servoctl.values import frozen
 
 AT_ZERO = 1e-9  # size of a state relative to the largest, below which it is the rounding of zero
 UNSTABLE = 10.0  # growth of an error along a motion above which the internal dynamics are unstable over it
@@ -35,21 +33,15 @@ EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λ
 MOST_GROWTH = 0.8  # of the logarithm of all growth: what is exponential has it, not one swing that is followed by drift
 GREAT = 1e4  # growth that is unstable even if it is a power of time
 SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
-FEWEST, MOST = 32, 2**14  # instants of the linearisation, first and last try
+FEWEST, MOST = 512, 2048  # at whose ends a motion is linearised, at first and where these do not resolve the growth
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
-LOCAL, DECAYED = 0.2, 1e-3  # relative difference of one such step that is accepted; norm below which it counts less
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
+ASIDE = 1e-10  # of the span and of the instant: distance on both sides of a knot, where the linearisation may jump
 TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of a segment and at its middle, summed
-DENSE = 3  # samples for each instant, with which instants are samples
-DEFECT = 1e-3  # of the sizes of the states: largest error, over an interval of samples, of states between them
-FIRST_PARTS = 4  # of a run that nothing resolves, whose first part may be unstable
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
-MODERATE = 1e8  # ‖P‖ ‖P⁻¹‖ of propagators P from the start, below which those between all instants follow from them
-SQUARINGS = 6  # of a matrix, from which its largest eigenvalue follows within a part of 2^-SQUARINGS of its logarithm
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
-_OF_VERDICT = UNSTABLE, EXPONENTIAL, FASTER, MOST_GROWTH, GREAT
-_SETTINGS = MODERATE, SWEEPS, BALANCED, TINY, SQUARINGS, *_OF_VERDICT  # of the growth in C
+GLANCES = 128  # intervals by which these instants are spread over the way of the states
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
@@ -72,8 +64,8 @@ class InternalDynamics(Shown):
         "none" for flat programs. Over the time of the run, and no longer: "unstable" if an error grows more than
         tenfold and exponentially or faster than a power of time can, or 1e4-fold, "stable" if none does and all errors
         of the start have shrunk at its end, "neutral" otherwise, as where phases drift apart. With a period, which says
-        something of all times, by the multipliers. "inconclusive" if the samples do not resolve it, unless
-        its first half, quarter, ... is unstable; the numbers are then those of that part.
+        something of all times, by the multipliers. "inconclusive" if the motion is too long or too quick for the
+        intervals over which it is linearised.
     growth : float
         max ‖Φ(t, s)‖, s <= t: the largest growth of an error from any instant of the run to any later one.
     left : float
@@ -95,7 +87,7 @@ class InternalDynamics(Shown):
     until: np.ndarray = field(default_factory=lambda: np.ones((2, 0)))
     period: float = 0.0
     multipliers: np.ndarray = field(default_factory=lambda: np.zeros(0, complex))
-    cause: str = "the samples do not resolve it; simulate with more of them (t_eval)"
+    cause: str = f"{MOST} intervals do not resolve it; simulate a shorter time"
 
     @property
     def t(self):
@@ -223,20 +215,22 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
 
     Notes
     -----
-    Instants are taken from the samples, more and more until growth by steps twice as long agrees; where the samples
-    are too few, the motion is integrated between them.
+    The motion is linearised at the ends of 512 intervals or a few more, on both sides of breaks of its paths, whatever
+    its samples. The growth counts if that by intervals twice as long agrees; otherwise 2048 intervals are tried.
     """
     model = require_run(run, "internal_dynamics")
     if model.flat:
         return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
+    t0, t1 = run.span
+    end = None if period is None else _end_of_first(positive("period", period), t0, t1)
+    tangents, *resolved = _propagated(model, run, t1)
     if switch := stays_on_switch(model, run):
         cause = f"the run stays on a switch, {switch}, and has no linearisation; {SMOOTHER}"
-        return replace(_inconclusive(model, run), cause=cause)
-    resolved = _resolved(model, run)
-    if resolved is None:
-        return _unstable_at_first(model, run) or _inconclusive(model, run)
-    judged = _judged(*resolved)
-    return judged if period is None else _with_multipliers(model, run, positive("period", period), judged)
+        return InternalDynamics(tangents, "inconclusive", np.nan, np.nan, cause=cause)
+    if not resolved:
+        return InternalDynamics(tangents, "inconclusive", np.nan, np.nan)
+    judged = _judged(tangents, *resolved)
+    return judged if end is None else _with_multipliers(model, run, end, period, judged)
 
 
 @np.errstate(all="ignore")
@@ -245,65 +239,43 @@ def growth_bound(model, run):
 
     It is exp max ∫ μ dt over all parts of the run, μ = λ_max(A + Aᵀ)/2 with A = Nᵀ J N in scaled states
     (Söderlind 2006, eq. (2.5)), where the integral is enlarged by its difference from that by every other instant; inf
-    where A is not finite or samples are few. One scale of the states, which balances the mean of (J N Nᵀ)², serves the
-    whole run. A large bound says nothing: where A turns, an error may stay small though μ is large.
+    where A is not finite. One scale of the states, which balances the mean of (J N Nᵀ)², serves the whole run. A large
+    bound says nothing: where A turns, an error may stay small though μ is large.
     """
-    x = _states(model, run)
-    if len(run.t) <= BOUNDED_AT // 2 or not np.isfinite(x).all():
+    t0, t1 = run.span
+    if t0 == t1:
         return np.inf
-    samples = _spread(run.t, x / _sizes(model, run)[:, None])
-    tangents = _tangents(model, run, samples, run.t[samples], x[:, samples])
-    t, N, JN = np.abs(tangents.t - run.t[0]), tangents.N, tangents.JN
-    if len(t) < len(samples):
+    t = _instants(run, t1, GLANCES)
+    x = run.at(t)[: len(model.state_names)]
+    if not np.isfinite(x).all():
+        return np.inf
+    picked = _spread(t, x / _sizes(x)[:, None], _knots(run, t1))
+    tangents = _linearised(run, t[picked], x[:, picked], _sizes(x))
+    t, N, JN = np.abs(tangents.t - t0), tangents.N, tangents.JN
+    if len(t) < len(picked):
         return np.inf
     slopes = JN @ N.swapaxes(1, 2)
     scale = _balance((slopes**2).mean(axis=0) + np.eye(len(x)) / t[-1] ** 2, BOUNDED_IN)[:, None]
     Q, R = np.linalg.qr(N / scale)
-    A = np.sign(run.t[-1] - run.t[0]) * Q.swapaxes(1, 2) @ (JN / scale) @ np.linalg.inv(R)
+    A = np.sign(t1 - t0) * Q.swapaxes(1, 2) @ (JN / scale) @ np.linalg.inv(R)
     mu = np.linalg.eigvalsh((A + A.swapaxes(1, 2)) / 2)[:, -1]
     fine, coarse = (_largest_integral(t[::stride], mu[::stride]) for stride in (1, 2))
     return float(np.exp(fine + abs(fine - coarse)))
 
 
-@np.errstate(all="ignore")
-def no_growth_by_series(model, run, last):
-    """Whether propagators by the series of a motion say that its internal dynamics are not unstable.
+def _spread(t, x, knots):
+    """BOUNDED_AT + 1 samples at equal parts of the time and of the way of the states x (n_x, N), first and last too.
 
-    They are those of `internal_dynamics`, without a Jacobian and without smaller and smaller steps; `last` is the
-    highest index of the coefficients of the motion, which is one by the Taylor method. False leaves the motion to be
-    judged by its linearisation, as where the series do not follow it.
+    Where none is between two knots, all that are there.
     """
-    x, size = _states(model, run), _sizes(model, run)
-    if len(run.variants) > 1 or switching(model) is not None or not np.isfinite(x[:, [0, -1]]).all():
-        return False
-    between, cuts = np.linspace(run.t[0], run.t[-1], BLOCKS + 1), breakpoints((run.t[0], run.t[-1]), run.knots)
-    moved = flow.Deviations(model, last, cuts, x[:, 0], size, between)
-    reached = moved.begin() and moved.move() and _small(np.abs(moved.x - x[:, -1]), size)
-    if not reached or not moved.defect() <= DEFECT:
-        return False
-    quiet, _, _ = flow.growth(moved.Z, len(between), _SETTINGS)
-    return quiet or _no_growth_by_steps(model, last, between, cuts, x[:, 0], size)
-
-
-def _no_growth_by_steps(model, last, between, cuts, x, size):
-    """The same by propagators over steps that end at all instants, whatever their sizes."""
-    forward = np.sign(between[-1] - between[0])
-    moved = flow.Deviations(model, last, forward * np.union1d(forward * between, forward * np.array(cuts)), x, size)
-    steps = moved.by_step() if moved.begin() else None
-    if steps is None:
-        return False
-    t, Q, R = steps
-    corners, ends = Tangents(model.state_names, t, size, Q, Q), np.searchsorted(forward * t, forward * between)
-    return not _unstable(corners, R, *_growth(corners, _propagators(R, ends)))
-
-
-def _spread(t, x):
-    """BOUNDED_AT + 1 samples at equal parts of the time and of the way of the states x (n_x, N), first and last too."""
     way, time = np.abs(np.diff(x)).sum(axis=0), np.abs(np.diff(t))
     part = np.cumsum(time / time.sum() + way / max(way.sum(), TINY))
     samples = np.searchsorted(part, np.linspace(0.0, part[-1], BOUNDED_AT + 1))
     samples[-1] = len(part)
-    return samples
+    if not len(knots):
+        return samples
+    pieces = np.searchsorted(np.abs(knots - t[0]), np.abs(t - t[0]))
+    return np.union1d(samples, np.flatnonzero(~np.isin(pieces, pieces[samples])))
 
 
 def _largest_integral(t, mu):
@@ -362,11 +334,11 @@ class Tangents:
 def linearised(model, run, count):
     """Internal dynamics linearised along a run: instants t (K,) [s] and A = Nᵀ J N (K, f, f) [1/s].
 
-    At most `count` instants are spread over the samples, and those without a finite Jacobian are left out; f is the
-    number of states less that of invariants.
+    At most `count` instants are spread over the run, and those without a finite Jacobian are left out; f is the number
+    of states less that of invariants.
     """
-    picked = evenly(len(run.t), count)
-    tangents = _tangents(model, run, picked, run.t[picked], _states(model, run)[:, picked])
+    t0, t1 = run.span
+    tangents = _tangents(model, run, t0 + (t1 - t0) * _irregular(count - 1))
     return tangents.t, tangents.frozen
 
 
@@ -375,35 +347,26 @@ def _dimension(model):
     return len(model.state_names) - len(invariant_names(model))
 
 
-def _states(model, run):
-    return run.jets[: len(model.state_names)]
-
-
-def _sizes(model, run):
-    """Largest magnitude of each state along a run (n_x,), 1 where it stays at zero."""
-    x = _states(model, run)
-    size = np.maximum(x.max(axis=1, initial=0.0), -x.min(axis=1, initial=0.0))
-    if not np.isfinite(size).all():
-        size = np.abs(x).max(axis=1, where=np.isfinite(x), initial=0.0)
+def _sizes(x):
+    """Largest magnitude of each state (n_x,) of states x (n_x, N), 1 where it stays at zero."""
+    size = np.abs(x).max(axis=1, where=np.isfinite(x), initial=0.0)
     return np.where(size > AT_ZERO * size.max(), size, 1.0)
 
 
-def _by_variant(model, run, samples):
-    """(variant of the model, whether it holds at the samples)."""
-    for first, end, variant in run.variants or ((0, len(run.t), model),):
-        inside = (samples >= first) & (samples < end)
-        if inside.any():
-            yield variant, inside
+def _tangents(model, run, t):
+    """Tangents at instants t (K,) of a run."""
+    x = run.at(t)[: len(model.state_names)]
+    return _linearised(run, t, x, _sizes(x))
 
 
-def _tangents(model, run, samples, t, x):
-    """Tangents at instants t (K,), states x (n_x, K), with the variants that hold at samples (K,)."""
-    size, f = _sizes(model, run), _dimension(model)
+def _linearised(run, t, x, size):
+    """Tangents at instants t (K,) and states x (n_x, K), in the states' sizes (n_x,), by the models that hold there."""
+    names, f = run.model.state_names, _dimension(run.model)
     N, JN = np.full((2, len(t), len(size), f), np.nan)
-    for variant, inside in _by_variant(model, run, samples):
-        N[inside], JN[inside] = _bases(variant, t[inside], x[:, inside], size)
+    for model, inside in run.by_model(t):
+        N[inside], JN[inside] = _bases(model, t[inside], x[:, inside], size)
     finite = np.isfinite(JN).all(axis=(1, 2))
-    return Tangents(model.state_names, t[finite], size, N[finite], JN[finite])
+    return Tangents(names, t[finite], size, N[finite], JN[finite])
 
 
 @np.errstate(all="ignore")
@@ -438,56 +401,29 @@ def _grid(interpreter, t, x, p):
     return y
 
 
-# --- instants that resolve the growth ---------------------------------------------------------------------------------
+# --- instants ---------------------------------------------------------------------------------------------------------
 
 
-def _resolved(model, run):
-    """Tangents, steps along them and propagators, at as many instants as needed; None if MOST do not do."""
-    finite, count = np.flatnonzero(np.isfinite(_states(model, run)).all(axis=0)), FEWEST
-    while count <= MOST and len(finite) > 1:
-        instants = _instants(model, run, finite, count)
-        if instants is not None:
-            tangents = _tangents(model, run, *instants).in_fours()
-            try:
-                steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
-            except np.linalg.LinAlgError:  # of rates near a singular state, which steps as long as these do not resolve
-                steps = longer = None
-            if steps is not None and longer is not None:
-                ends = _block_ends(tangents.t[::2])
-                propagators = _propagators(steps, ends)
-                coarse = _propagators(longer, ends[ends % 2 == 0] // 2)
-                if _mismatch(steps, longer) < LOCAL and _agree(propagators, coarse):
-                    return tangents, steps, propagators
-        count *= 2
-    return None
+def _knots(run, t1):
+    """Knots (K,) within a run up to t1, in its direction."""
+    return np.array(breakpoints((run.span[0], t1), run.knots)[1:-1])
 
 
-@np.errstate(all="ignore")
-def _instants(model, run, finite, count):
-    """Samples, instants and states at `count` + 1 irregular instants or more; None if the states fail.
+def _instants(run, t1, count):
+    """Ends of `count` intervals of a run up to t1, or more: of four at least from a knot to the next, and around it.
 
-    States between samples are those of Hermite's cubic, or of steps where instants are denser than samples. Instants
-    at equal distances would see a periodic linearisation at one phase only.
+    Instants at equal distances would see a periodic linearisation at one phase only. They are closer together towards
+    the end of a motion that stopped, where its rates may have no bound.
     """
-    if DENSE * count < len(finite):
-        samples = finite[((len(finite) - 1) * _irregular(count)).round().astype(int)]
-        return samples, run.t[samples], _states(model, run)[:, samples]
-    if count > 4 * (len(finite) - 1):
-        return _stepped(model, run, finite, 4 * -(-count // (4 * (len(finite) - 1))))
-    last, x, place = len(finite) - 1, _states(model, run), (len(finite) - 1) * _irregular(count)
-    k = np.minimum(place.astype(int), last - 1)
-    starts, ends, s = finite[k], finite[k + 1], place - k
-    h, chord = run.t[ends] - run.t[starts], x[:, ends] - x[:, starts]
-    a, b = (h * _rates(model, run, starts, run.t[i], x[:, i]) - chord for i in (starts, ends))
-    t, z = run.t[starts] + s * h, x[:, starts] + s * chord + s * (1 - s) * ((1 - s) * a - s * b)
-    slope = chord + (1 - s) * (1 - 3 * s) * a + s * (3 * s - 2) * b
-    gap = np.abs(slope - h * _rates(model, run, starts, t, z))
-    return (starts, t, z) if _small(gap, _sizes(model, run)[:, None]) else None
-
-
-def _small(errors, sizes):
-    """Whether errors of the states are small against their sizes, or those that integration leaves anyway."""
-    return bool(np.all(errors <= DEFECT * sizes + STEP_ERROR))
+    t0, knots = run.span[0], _knots(run, t1)
+    beside = ASIDE * (np.abs(knots) + abs(t1 - t0)) * np.sign(t1 - t0)
+    ends = np.concatenate([[t0], np.column_stack([knots - beside, knots + beside]).ravel(), [t1]])
+    shares = np.abs(np.diff(ends)) / (abs(t1 - t0) or 1.0)
+    parts = [_irregular(4 * max(1, round(count / 4 * share))) for share in shares]
+    if run.status < 0:
+        parts[-1] = 1 - (1 - parts[-1]) ** 2
+    pieces = [a + (b - a) * part[:-1] for a, b, part in zip(ends[:-1], ends[1:], parts, strict=True)]
+    return np.append(np.concatenate(pieces), t1)
 
 
 def _irregular(count):
@@ -498,44 +434,18 @@ def _irregular(count):
     return (k + beside) / count
 
 
-def _stepped(model, run, finite, steps):
-    """Samples, instants and states of RK4 steps from each sample to the next; None if they do not lead there."""
-    starts, ends, x = finite[:-1], finite[1:], _states(model, run)
-    t = run.t[starts] + np.multiply.outer(_irregular(steps), run.t[ends] - run.t[starts])
-    states = [x[:, starts]]
-    for a, h in zip(t[:-1], np.diff(t, axis=0), strict=True):
-        states.append(_advanced(model, run, starts, a, states[-1], h))
-    if not _small(np.abs(states[-1] - x[:, ends]), _sizes(model, run)[:, None]):
-        return None
-    between = np.array(states[:-1]).transpose(1, 2, 0).reshape(len(x), -1)
-    samples, instants = np.append(np.repeat(starts, steps), ends[-1]), np.append(t[:-1].T, run.t[ends[-1]])
-    return samples, instants, np.column_stack([between, x[:, ends[-1]]])
-
-
-@np.errstate(all="ignore")
-def _advanced(model, run, samples, t, x, h):
-    """States after a step of RK4 from each state (n_x, N)."""
-    k1 = _rates(model, run, samples, t, x)
-    k2 = _rates(model, run, samples, t + h / 2, x + h / 2 * k1)
-    k3 = _rates(model, run, samples, t + h / 2, x + h / 2 * k2)
-    k4 = _rates(model, run, samples, t + h, x + h * k3)
-    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-
-def _rates(model, run, samples, t, x):
-    """X' at instants t (N,) and states x (n_x, N), with the variants that hold at samples (N,)."""
-    y = np.empty_like(x)
-    for variant, inside in _by_variant(model, run, samples):
-        f = variant.function("ode").interpreted
-        y[:, inside] = _grid(f, t[inside], x[:, inside], variant.p)[: len(x)]
-    return y
-
-
-def _mismatch(steps, longer):
-    """Largest relative difference between a pair of steps and the step that is twice as long."""
-    pairs = steps[1::2] @ steps[::2]
-    size = np.maximum(_frobenius(pairs), _frobenius(longer))
-    return float((_frobenius(pairs - longer) / np.maximum(size, DECAYED)).max())
+def _propagated(model, run, t1):
+    """Tangents along a run up to t1, and, if enough to resolve the growth, steps along them and propagators."""
+    for count in (FEWEST, MOST):
+        tangents = _tangents(model, run, _instants(run, t1, count)).in_fours()
+        steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
+        if steps is None or longer is None:
+            continue
+        ends = _block_ends(tangents.t[::2])
+        propagators = _propagators(steps, ends)
+        if _agree(propagators, _propagators(longer, ends[ends % 2 == 0] // 2)):
+            return tangents, steps, propagators
+    return (tangents,)
 
 
 def _agree(propagators, longer):
@@ -558,22 +468,22 @@ def _steps(tangents):
     """Y of each segment, which has an instant within it, (S, f, f); None if a tangent space turns too far in one."""
     t, N, JN = tangents.t, tangents.N, tangents.JN
     a, m, b = slice(0, -2, 2), slice(1, -1, 2), slice(2, None, 2)
-    if len(t) < 3:
+    if len(t) < 3 or t[0] == t[-1]:
         return None
     M = N[m].swapaxes(1, 2)
     G0, G1 = M @ N[a], M @ N[b]
     if max((G.shape[1] - (G**2).sum(axis=(1, 2))).max() for G in (G0, G1)) > TURNED:
         return None
-    B0, B, B1 = M @ JN[a] @ np.linalg.inv(G0), M @ JN[m], M @ JN[b] @ np.linalg.inv(G1)
     h = (t[b] - t[a])[:, None, None]
     c = (t[m] - t[a])[:, None, None] / h
     w = 1 / (6 * c * (1 - c))  # of the quadratic through three values
-    omega = h * ((0.5 - w * (1 - c)) * B0 + w * B + (0.5 - w * c) * B1)
-    small = _frobenius(omega)[:, None, None] < 1  # where the series converges
-    omega = omega - small * h**2 / 12 * (B0 @ B1 - B1 @ B0)
     try:
+        B0, B, B1 = M @ JN[a] @ np.linalg.inv(G0), M @ JN[m], M @ JN[b] @ np.linalg.inv(G1)
+        omega = h * ((0.5 - w * (1 - c)) * B0 + w * B + (0.5 - w * c) * B1)
+        small = _frobenius(omega)[:, None, None] < 1  # where the series converges
+        omega = omega - small * h**2 / 12 * (B0 @ B1 - B1 @ B0)
         return np.linalg.solve(G1, _exponential(omega) @ G0)
-    except np.linalg.LinAlgError:  # Ω so large that e^Ω is lost to rounding
+    except np.linalg.LinAlgError:  # of rates near a singular state, or where e^Ω is lost to rounding
         return None
 
 
@@ -718,33 +628,12 @@ def _judged(tangents, steps, propagators):
     return InternalDynamics(tangents, verdict, growth, left, until)
 
 
-def _unstable_at_first(model, run):
-    """The verdict on the first half, quarter, ... of a run that nothing resolves, if it is unstable; None otherwise."""
-    for part in 2.0 ** -np.arange(1, FIRST_PARTS + 1):
-        n = int(np.searchsorted(np.abs(run.t - run.t[0]), part * np.abs(run.t[-1] - run.t[0]), side="right"))
-        variants = tuple((a, min(b, n), variant) for a, b, variant in run.variants if a < n)
-        first = replace(run, t=run.t[:n], jets=_states(model, run)[:, :n], variants=variants)
-        resolved = _resolved(model, first) if n > 1 else None
-        if resolved is not None:
-            judged = _judged(*resolved)
-            return judged if judged.verdict == "unstable" else None
-    return None
-
-
-def _inconclusive(model, run):
-    """No verdict, as no number of instants resolves the growth; with frozen eigenvalues at samples."""
-    samples = evenly(len(run.t), FEWEST)
-    tangents = _tangents(model, run, samples, run.t[samples], _states(model, run)[:, samples])
-    return InternalDynamics(tangents, "inconclusive", np.nan, np.nan)
-
-
-def _with_multipliers(model, run, period, judged):
-    """The verdict by Floquet's multipliers over the first period of a run."""
-    first = _first(model, run, period)
-    resolved = _resolved(model, first)
-    if resolved is None:
+def _with_multipliers(model, run, end, period, judged):
+    """The verdict by Floquet's multipliers over the first period of a run, up to its end [s]."""
+    tangents, *resolved = _propagated(model, run, end)
+    if not resolved:
         return replace(judged, verdict="inconclusive", period=period)
-    tangents, _, (_, Y, log) = resolved
+    _, (_, Y, log) = resolved
     back = tangents.N[0].T @ tangents.N[-1]
     _require_periodic(period, tangents, back)
     multipliers = np.exp(log[0, -1]) * np.linalg.eigvals(back @ Y[0, -1]).astype(complex)
@@ -754,9 +643,9 @@ def _with_multipliers(model, run, period, judged):
     return replace(judged, verdict=verdict, period=period, multipliers=multipliers[order])
 
 
-def _first(model, run, period):
-    """The run up to the end of its first period."""
-    length, direction = abs(run.t[-1] - run.t[0]), np.sign(run.t[-1] - run.t[0])
+def _end_of_first(period, t0, t1):
+    """The instant [s] at which the first period of a run from t0 to t1 ends."""
+    length = abs(t1 - t0)
     if not period <= length * (1 + SAME_TIME):
         raise SpecificationError(
             f"period={period:g} s was given for a run of {length:g} s.",
@@ -765,14 +654,7 @@ def _first(model, run, period):
             period=period,
             length=length,
         )
-    inside = np.flatnonzero(np.abs(run.t - run.t[0]) < period * (1 - SAME_TIME))
-    last, instants = inside[-1:], np.linspace(run.t[inside[-1]], run.t[0] + direction * period, FEWEST + 1)
-    x = _states(model, run)[:, last]
-    for t, h in zip(instants[:-1], np.diff(instants), strict=True):
-        x = _advanced(model, run, last, np.array([t]), x, h)
-    variants = tuple((a, min(b, len(inside) + 1), variant) for a, b, variant in run.variants if a <= len(inside))
-    states = np.column_stack([_states(model, run)[:, inside], x])
-    return replace(run, t=np.append(run.t[inside], instants[-1]), jets=states, variants=variants)
+    return t0 + np.sign(t1 - t0) * min(period, length)
 
 
 def _require_periodic(period, tangents, back):

@@ -389,6 +389,12 @@ class Run(Sampled, Value):
         which = piece_of(self._pieces, t)
         return [(self._pieces[i].model, which == i) for i in np.unique(which)]
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and the last instant of the motion [s]; samples may leave out a part of it."""
+        ends = [piece.t for piece in self.steps] or [self.t]
+        return float(ends[0][0]), float(ends[-1][-1])
+
     @cached_property
     def _pieces(self):
         """The steps of the run, or what passes through its samples."""
@@ -397,7 +403,7 @@ class Run(Sampled, Value):
     def _within(self, t):
         """Instants (N,) of the run, without what rounding lets them exceed it."""
         times = np.atleast_1d(finite("t", t, "time") if np.ndim(t) == 0 else as_numbers(t))
-        low, high = min(self.t[0], self.t[-1]), max(self.t[0], self.t[-1])
+        low, high = sorted(self.span)
         outside = ~((low - SAME_TIME * (1 + abs(low)) <= times) & (times <= high + SAME_TIME * (1 + abs(high))))
         if outside.any():
             t = float(times[np.argmax(outside)])
@@ -528,6 +534,23 @@ def range_in_words(name, low, t_low, high, t_high, unit):
     low, high = (f"{digits(value)} {unit}".rstrip() for value in (low, high))
     at_low, at_high = ("" if np.isnan(t) else f" (t = {t:.4g} s)" for t in (t_low, t_high))
     return f"  {name}: {low} throughout" if low == high else f"  {name}: {low}{at_low} .. {high}{at_high}"
+
+
+def _hermite_between(levels, i, s, h):
+    """Values at s (N,) within intervals i of lengths h (N,), of values with derivatives at samples."""
+    from math import factorial
+
+    count = len(levels)
+    powers = np.arange(2 * count)
+    derivative = np.array([[factorial(p) / factorial(p - k) if p >= k else 0.0 for p in powers] for k in range(count)])
+
+    def at(s, k):
+        return derivative[k] * np.power.outer(s, np.maximum(powers - k, 0))
+
+    system = np.array([*(at(0.0, k) for k in range(count)), *(at(1.0, k) for k in range(count))])
+    ends = [level[:, j] * h**k for j in (i, i + 1) for k, level in enumerate(levels)]
+    c = np.tensordot(np.linalg.inv(system), np.stack(ends), 1)  # (2 count, n, N)
+    return np.einsum("Np,pnN->nN", at(s, 0), c)
 
 
 class _Residuals(Mapping):

@@ -9,20 +9,18 @@ from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span, within
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, warn
-from servoctl.growth import FEWEST, STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics, no_growth_by_series
+from servoctl.growth import STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
 from servoctl.methods.accuracy import (
     ATOL,
     absolute_tolerances,
     accurate,
     large_tolerances,
-    method_for,
     unlike_tolerances,
 )
 from servoctl.methods.algebraic import algebraic
 from servoctl.methods.bounded import bounded
 from servoctl.methods.choice import (
     EXPLICIT,
-    ORDERS,
     Adaptive,
     Algebraic,
     Bounded,
@@ -45,7 +43,7 @@ from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.stability import run_checked, warn_drifted, warn_many_steps, warn_unstable
-from servoctl.methods.taylor import TaylorSteps, Unsuited, last_index
+from servoctl.methods.taylor import TaylorSteps, Unsuited
 from servoctl.methods.transient import first_transient
 from servoctl.model.equations import invariant_names
 from servoctl.model.following import SMOOTHER, breaks_within
@@ -63,8 +61,6 @@ STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no ste
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 MOST_ENDS = 10**6  # of steps that `max_step` asks for: more would fill the memory
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
-FEW_STEPS = 100  # of a motion, up to which its series tell about growth sooner than a bound does
-BESIDE_ROUND = 1e-3  # of an interval: own samples keep off round numbers, where formulas may be 0/0
 OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
@@ -145,80 +141,23 @@ def simulate(
     span = as_span(t_span)
     others = {"events": as_events(events), "progress": progress, "max_step": max_step}
 
-    def motion(times):
-        def attempt(method, drift):
-            return simulated(model, start, span, method, t_eval=times, drift=drift, **others)
+    def attempt(method, drift):
+        return simulated(model, start, span, method, t_eval=t_eval, drift=drift, **others)
 
-        return attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
-
-    if not _has_internal_dynamics(model) or not _integrates(method):
-        return motion(t_eval)
-    times = None if t_eval is None else sample_times(*span, t_eval, (), method)
-    tolerance, own = getattr(method, "rtol", STEP_ERROR), _own_times(method, span, times)
+    judging = _has_internal_dynamics(model) and (method is None or as_method(method).forward)
+    tolerance = getattr(method, "rtol", STEP_ERROR)
     try:
-        enough = own(FEWEST + 1)
-        run = motion(times if enough is None else enough)
+        run = attempt(method, drift) if accuracy is None else accurate(attempt, model, accuracy, method, drift)
     except ServoError as error:
-        if error.run is not None:
-            error.run = _sampled(error.run.with_verdict(partial(_verdict, tolerance=tolerance)), times)
+        if judging and error.run is not None:
+            error.run = error.run.with_verdict(partial(_verdict, tolerance=tolerance))
         raise
-    dense = own(DEFAULT_SAMPLES)
-    again = None if dense is None else partial(motion, dense)
-    first = method if accuracy is None else method_for(model, accuracy, getattr(method, "jets", None))
-    run = _sampled(judged(run, tolerance, again, _series_of(run, first)), None if dense is None else times)
+    if not judging:
+        return run
+    run = judged(run, tolerance)
     if said := first_transient(run, partial(simulated, model)):
         warn(f"{said}.")
     return run
-
-
-def _series_of(run, method):
-    """Highest index of the coefficients with which a run was computed; None if it is none of the Taylor method."""
-    if run.method != Taylor.__name__:
-        return None
-    return last_index(run.model, Taylor() if method is None else as_method(method))
-
-
-def _integrates(method):
-    """Whether a method goes forward from its start, so that its errors grow with time."""
-    return method is None or as_method(method).forward
-
-
-def _own_times(method, span, times):
-    """A function that gives the samples and a count of others along the span.
-
-    It gives None for all steps, the default, or samples that are as dense.
-    """
-    fixed_steps = method is not None and isinstance(as_method(method), RungeKutta)
-    if times is None or fixed_steps:
-        return lambda count: None
-    gap, length = np.abs(times[1:] - times[:-1]).max(initial=0.0), abs(span[1] - span[0])
-    whole = times[0] == span[0] and times[-1] == span[1]
-
-    def own(count):
-        if whole and (count - 1) * gap <= length * (1 + SAME_TIME):
-            return None
-        between = np.linspace(*span, count)
-        between[1:-1] += BESIDE_ROUND * (span[1] - span[0]) / count
-        return np.union1d(times, between)[:: 1 if span[1] > span[0] else -1]
-
-    return own
-
-
-def _sampled(run, times):
-    """The run at its samples among some times; all of it without times, and the state in which it stopped anyway.
-
-    Its verdict remains that of all its samples.
-    """
-    if times is None:
-        return run
-    verdict = partial(run.verdict, run) if callable(run.verdict) else run.verdict
-    if run.method in ORDERS:
-        return replace(_resampled(run, times), verdict=verdict)
-    picked = np.isin(run.t, times)
-    picked[-1] |= run.status != 0 or not picked.any()
-    index = np.append(0, np.cumsum(picked))
-    variants = tuple((int(index[a]), int(index[b]), v) for a, b, v in run.variants if index[b] > index[a])
-    return replace(run, t=run.t[picked], jets=run.jets[:, picked], variants=variants, verdict=verdict)
 
 
 def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t_eval=None, events=None, progress=None):
@@ -306,39 +245,26 @@ def _has_internal_dynamics(model):
     return bool(model.reduction.program.residuals) and not model.flat
 
 
-def judged(run, tolerance=STEP_ERROR, again=None, by_series=None):
+def judged(run, tolerance=STEP_ERROR):
     """A run that gives the verdict on its internal dynamics when it is read; warns at once if they are unstable.
 
-    Most motions need no propagators to know that there is nothing to warn of. Whoever interrupts a motion does not
-    wait. `tolerance` is the relative error of a step of the run's method, `again` returns the same motion with more
-    samples where the run has few of them, and `by_series` is the highest index of the coefficients of a motion by the
-    Taylor method.
+    Most motions need no propagators to know that there is nothing to warn of: a bound of the growth tells. Whoever
+    interrupts a motion does not wait. `tolerance` is the relative error of a step of the run's method.
     """
-    known = run.with_verdict(partial(_verdict, tolerance=tolerance))
+    later = run.with_verdict(partial(_verdict, tolerance=tolerance))
     try:
-        if not run.success or _quiet(run, by_series):
-            return known
-        run = run if again is None else again()
-        internal = internal_dynamics(run) if run.success else None
+        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+            return later
+        known = later.with_verdict(dict(later.internal))
     except KeyboardInterrupt:
-        return _interrupted_at_its_end(known)
-    if internal is None:  # interrupted while it was computed with more samples
-        return _interrupted_at_its_end(known)
-    if internal.verdict == "unstable":
-        warn_unstable(internal.sentence(tolerance))
-    return run.with_verdict(internal.facts(tolerance))
+        return _interrupted_at_its_end(later)
+    if known.internal["verdict"] == "unstable":
+        warn_unstable(known.internal["text"])
+    return known
 
 
-def _quiet(run, by_series):
-    """Whether the series, or the bound of the growth, tell that it deserves no warning; the quicker comes first."""
-    ways = [lambda: growth_bound(run.model, run) <= UNSTABLE]
-    if by_series is not None:
-        ways.insert(run.counters["steps"] > FEW_STEPS, lambda: no_growth_by_series(run.model, run, by_series))
-    return any(way() for way in ways)
-
-
-def _verdict(run, _=None, *, tolerance):
-    """The verdict on the internal dynamics of a run, for those of its samples that are left."""
+def _verdict(run, tolerance):
+    """The verdict on the internal dynamics of a run."""
     return internal_dynamics(run).facts(tolerance)
 
 

@@ -74,25 +74,10 @@ def test_a_computed_motion_is_kept_when_interrupted_at_its_end(wheel_model, meth
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-@pytest.mark.parametrize("while_", ["growth_bound", "no_growth_by_series", "internal_dynamics", "_interrupted motion"])
+@pytest.mark.parametrize("while_", ["growth_bound", "internal_dynamics"])
 def test_a_motion_is_kept_when_its_growth_is_judged(wheel_model, while_, ctrl_c, monkeypatch):
     model, start = wheel_model
-    compute, calls = simulation._motion, []
-
-    def interrupt(*_):
-        signal.raise_signal(signal.SIGINT)
-
-    def interrupted(*given):  # the second, with more samples
-        motion = compute(*given)
-        calls.append(motion)
-        motion.interrupted = len(calls) == 2
-        return motion
-
-    monkeypatch.setattr(simulation, "no_growth_by_series", lambda *_: False)
-    if while_ == "_interrupted motion":
-        monkeypatch.setattr(simulation, "_motion", interrupted)
-    else:
-        monkeypatch.setattr(simulation, while_, interrupt)
+    monkeypatch.setattr(simulation, while_, lambda *_: signal.raise_signal(signal.SIGINT))
     monkeypatch.setattr(simulation, "UNSTABLE", 0.0)
     ctrl_c(60.0)
     run = sv.simulate(model, start, (0.0, 1.0), t_eval=[0.0, 0.5, 1.0])

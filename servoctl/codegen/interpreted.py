@@ -119,16 +119,17 @@ class Interpreter:
         r = np.zeros((len(t), jets_in(self._f)))
         run, alive = connected(f, [*parts[:3], r, parts[3]])
 
-        def filled():
-            r[:] = jets_at(self._f, t, p.T).T
+        def filled(jets=None):
+            r[:] = jets_at(self._f, t, p.T).T if jets is None else jets
             run()
 
         return filled, alive
 
-    def _value(self, t, x, p):
+    def _value(self, t, x, p, *jets):
+        """The outputs at a point, with the jets of references if they are known."""
         row_t, row_x, row_p, row_y, run = self.workspace.row
         row_t[0], row_x[:], row_p[:] = t, x, p
-        run()
+        run(*jets)
         return row_y.copy()
 
     def native(self, suffix):
@@ -154,8 +155,13 @@ class Interpreter:
                 parts[2][:, :size] = p[:, here]
             run()
             y[:, here] = parts[3][:, :size]
-        for k in range(blocks, t.size):
-            y[:, k] = self._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p)
+        left = slice(blocks, None)
+        for k, jets in zip(range(blocks, t.size), self._jets(t[left], p[:, left] if p.ndim == 2 else p), strict=True):
+            y[:, k] = self._value(t[k], x[:, k], p[:, k] if p.ndim == 2 else p, *jets)
+
+    def _jets(self, t, p):
+        """For each of the times (N,), what a single evaluation takes beside t, x and p: jets of references, if any."""
+        return [(jets,) for jets in jets_at(self._f, t, p).T] if len(t) and jets_in(self._f) else [()] * len(t)
 
     @functools.cached_property
     def _blocks(self):

@@ -2,8 +2,6 @@
 
 import contextlib
 import ctypes
-import functools
-import math
 
 import numpy as np
 
@@ -72,15 +70,6 @@ def riccati(A, B, Q, R, P, of_state=True):
         outputs = (pointer(P), pointer(gains[part]), pointer(H[part]))
         call(_length(part), *given, pointer(R), ctypes.c_int64(of_state), *outputs)
     return gains, H, P
-
-
-@functools.cache
-def of_any_size(file, name):
-    """A C function of a file that takes the sizes of its matrices, returning a number; None without a compiler."""
-    call = _function(file, name, math.inf)
-    if call is not None:
-        call.restype = ctypes.c_int64
-    return call
 
 
 def _by_numpy(A, B, Q, R, P, of_state):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.dense import Dense, steps_of
+from servoctl.dense import Dense, steps_of, up_to
 from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.methods.choice import Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
@@ -118,10 +118,11 @@ class Motion:
         """Drop the samples from an instant t [s] on, and stop there for an error."""
         self.stop = error  # first: if Ctrl-C comes between the two, the same samples are cut again
         self._cut(int(np.flatnonzero(self.t == t)[0]))
+        self.steps = up_to(self.steps, self.t[-1]) if len(self.t) else []
 
     def end_after(self, t, error):
         """Drop the samples after an instant t [s], and stop there for an error."""
-        self.stop, times = error, self.t
+        self.stop, times, self.steps = error, self.t, up_to(self.steps, t)
         if len(times) > 1:
             self._cut(int(np.sum(times <= t if times[-1] > times[0] else times >= t)))
 

@@ -184,5 +184,4 @@ void FN(taylor_jets)(const double *log, int64_t n, const int64_t *k, const doubl
     if (settled) by_rows(log, n, k, t, p, settled, jets, 0);
 }
 
-#include "deviations.h"
 #include "whole.h"
