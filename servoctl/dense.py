@@ -14,13 +14,13 @@ DISTINCT = 1e-6  # of the mean distance of samples: between nearer ones polynomi
 NODES = 9  # of the polynomial by which a signal is known within an interval: pulses of a tenth of it are seen
 PROBES = np.array([-0.611, 0.137])  # where it is compared with the signal; on no symmetry of the nodes
 PARTS = 200  # intervals of a motion, at least: a signal that acts for a thousandth of it is seen
-RESOLVED = 1e-7  # of a signal's range: error of polynomials that is accepted; that of their extremes is its square
-ROUNDING = 1e-12  # of the size of signals of a kind: what is smaller is rounding
+FITS = 1e-7  # of a signal's range: error of polynomials that is accepted; that of their extremes is its square
+AS_ZERO = 1e-12  # of the size of signals of a kind: what is smaller is rounding
 MOST_PROBED = 400_000  # instants at which a signal is evaluated: 5,000 periods, and a second
 CANDIDATES = 5  # intervals in which the extreme points of polynomials are looked at
 TOUCHES = 1e-6  # imaginary part of a root that is real but for rounding, as where a slope touches zero
-SHORTEST = 1e-12  # of a span: an interval that is not halved
-BESIDE = 1e-9  # of an interval: how far within it its ends are looked at, as a signal may jump there
+LEAST_PART = 1e-12  # of a span: an interval that is not halved
+INWARDS = 1e-9  # of an interval: how far within it its ends are looked at, as a signal may jump there
 
 
 @frozen(eq=False)
@@ -171,7 +171,7 @@ def extremes(value, cuts, t, known, size):
         (_, low), (_, high) = found
         error, bounds = curve.judged(y)
         beyond = np.array([bounds[0] < low, bounds[1] > high]) & np.isfinite(error)
-        rough = beyond.any(axis=0) & (error > RESOLVED * (high - low) + ROUNDING * size)
+        rough = beyond.any(axis=0) & (error > FITS * (high - low) + AS_ZERO * size)
         for i, sign in enumerate((-1.0, 1.0)):
             last = np.flatnonzero(beyond[i] & ~rough)
             last = last[np.argsort(sign * bounds[i, last])[-CANDIDATES:]]
@@ -196,7 +196,7 @@ def one_sign_apart(value, edges):
         size = np.nanmax(np.abs(y), initial=size)
         error, (low, high) = curve.judged(y)
         near = (low <= 0) & (high >= 0) & np.isfinite(error)
-        rough = near & (error > RESOLVED * size) & (b - a > SHORTEST * (edges[-1] - edges[0]))
+        rough = near & (error > FITS * size) & (b - a > LEAST_PART * (edges[-1] - edges[0]))
         found.extend(curve.turns(a[k], b[k], y[k]) for k in np.flatnonzero(near & ~rough))
         found.append((a[rough] + b[rough]) / 2)
         return rough
@@ -207,7 +207,7 @@ def one_sign_apart(value, edges):
 
 def parted(cuts, span):
     """The ascending cuts with further instants between them, `PARTS` of them in a span [s]."""
-    parts = np.maximum(np.ceil(np.diff(cuts) / (span / PARTS) * (1 - SHORTEST)), 1).astype(int)
+    parts = np.maximum(np.ceil(np.diff(cuts) / (span / PARTS) * (1 - LEAST_PART)), 1).astype(int)
     k = np.repeat(np.arange(len(parts)), parts)
     within = (np.arange(len(k)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[k]
     return np.append(cuts[:-1][k] + within * np.diff(cuts)[k], cuts[-1])
@@ -238,7 +238,7 @@ class _Curve:
 
     def __init__(self):
         nodes = chebyshev.chebpts1(NODES)
-        ends = 1 - 2 * BESIDE
+        ends = 1 - 2 * INWARDS
         self.places = np.sort(np.concatenate([nodes, PROBES, [-ends, ends]]))
         self.nodes, self.probes = (np.searchsorted(self.places, some) for some in (nodes, np.sort(PROBES)))
         self.fit = np.linalg.inv(chebyshev.chebvander(nodes, NODES - 1))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span, within
+from servoctl.dense import up_to
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, warn
 from servoctl.growth import STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
 from servoctl.methods.accuracy import (
@@ -37,7 +38,6 @@ from servoctl.methods.choice import (
 )
 from servoctl.methods.events import Event, Events, as_events, occurrences
 from servoctl.methods.motion import DEFAULT_SAMPLES, breakpoints, margin_at, without_interruption
-from servoctl.methods.orders import end_where_orders_change
 from servoctl.methods.radau import RadauSteps
 from servoctl.methods.runge_kutta import RungeKuttaSteps
 from servoctl.methods.scipy_methods import ScipySteps
@@ -181,7 +181,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t
 
     def finished():
         motion.end_where_undefined(str(method))
-        end_where_orders_change(motion)
+        motion.end_where_orders_change()
         started = _as_started(model, start, t0, x0 if motion.start is None else motion.start)
         run = _run(model, motion, (method, drift, knots), started, t1)
         return _resampled(run, times) if t_eval is not None and isinstance(method, RungeKutta) else run
@@ -383,7 +383,7 @@ def _run(model, motion, settings, start, t1):
         _set_at_knots(t, jets, facts["variants"], knots)
     facts["events"] = occurrences(motion.occurrences, partial(jet_names_to, model))
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
-    facts["steps"] = tuple(motion.steps)
+    facts["steps"] = tuple(motion.steps if motion.stop is None else up_to(motion.steps, t[-1]))
     return Run(t, jets, jet_names_to(model, len(jets)), model, start=start, **facts)
 
 

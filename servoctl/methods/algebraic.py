@@ -55,7 +55,7 @@ class _Algebraic(Stepping):
 
     def _jets(self, z):
         """Jets (q, γ', γ'') from q and further outputs of `Equations.path`."""
-        return _jets_of(self.model, z)
+        return _jets_from(self.model, z)
 
     def _pivots_of(self, outputs):
         return self._levels(outputs)[2]
@@ -93,7 +93,7 @@ class _Algebraic(Stepping):
         if z.shape[1] < len(times):
             return False
         self.motion.fill(self.model, times, self._jets(z))
-        self.motion.keep(self.model, nodes[:, 0], _Between(self.model, self.f, nodes))
+        self.motion.keep(self.model, nodes[:, 0], _Solved(self.model, self.f, nodes))
         self.motion.start = np.concatenate([nodes[0, 1 : 1 + nq], self._levels(outputs[:, 0])[0]])
         self.motion.count(iterations=followed + solved, steps=len(nodes) - 1)
         self.progress(cuts[-1])
@@ -180,7 +180,7 @@ class _Algebraic(Stepping):
 
     def _meets_event(self, nodes, end, stops):
         """Whether a terminal event ends the motion between nodes; the samples up to it are then recorded."""
-        t, dense = np.append(nodes[:-1, 0], end), _Between(self.model, self.f, nodes)
+        t, dense = np.append(nodes[:-1, 0], end), _Solved(self.model, self.f, nodes)
         found = self.events.first(self.model, t, lambda s: dense(None, s, self.p), stops)
         if found is not None:
             x, top = np.split(found.jets[:, None], [len(self.model.state_names)])
@@ -193,7 +193,7 @@ class _Algebraic(Stepping):
     def _sample(self, nodes, x, t, t1):
         """Solve at the pending instants up to t, where the state is x; at all of them if the motion ends there."""
         if len(nodes) > 1:
-            self.motion.keep(self.model, nodes[:, 0], _Between(self.model, self.f, nodes), (), t)
+            self.motion.keep(self.model, nodes[:, 0], _Solved(self.model, self.f, nodes), (), t)
         count = len(self.pending) if t == t1 else int(np.sum((self.pending - t) * self.direction <= 0))
         now, self.pending = self.pending[:count], self.pending[count:]
         for first in range(0, count, BLOCK):
@@ -208,7 +208,7 @@ class _Algebraic(Stepping):
                 self.progress(block[-1])
 
 
-def _jets_of(model, z):
+def _jets_from(model, z):
     """Jets (q, γ', γ'') from q and further outputs of `Equations.path` (n_y, N)."""
     nq, n = model.nq, model.n
     if model.reduction.mechanism.q.plain:
@@ -217,7 +217,7 @@ def _jets_of(model, z):
 
 
 @frozen(eq=False)
-class _Between:
+class _Solved:
     """Jets between nodes, which `Equations.path` f solves for."""
 
     model: object
@@ -233,7 +233,7 @@ class _Between:
         """Jets (n_z, N) at instants (N,), whatever the steps; NaN where there is no solution."""
         order = np.argsort(np.sign(self.nodes[-1, 0] - self.nodes[0, 0]) * t)
         z, _ = self.f.newton(t[order], self.nodes, p)
-        solved = _jets_of(self.model, z)
+        solved = _jets_from(self.model, z)
         jets = np.full((len(solved), len(t)), np.nan)
         jets[:, order[: solved.shape[1]]] = solved
         return jets

@@ -165,7 +165,7 @@ class BulkSteps(Stepping):
     def _record(self, steps, first, last, end=None):
         """Keep the steps from `first` to before `last`, or to an end within it, and record the samples in them."""
         direction = 1.0 if self.forward else -1.0
-        dense = _Between(steps, self.f, self.model.n, self.projection)
+        dense = _Stepped(steps, self.f, self.model.n, self.projection)
         ends, until = steps.t[first : last + 1 + (end is not None)], None if end is None else end.t
         self.motion.keep(self.model, ends, dense, self.coefficients, until, first)
         due = direction * self.pending <= direction * (steps.t[last] if end is None else end.t)
@@ -180,7 +180,7 @@ class BulkSteps(Stepping):
 
 
 @frozen(eq=False)
-class _Between:
+class _Stepped:
     """Jets within steps, with γ^(s̄), n values of the function f of X'; `projection` restores states, unless None."""
 
     steps: Steps

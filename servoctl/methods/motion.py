@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from servoctl.dense import Dense, steps_of, up_to
+from servoctl.dense import Dense, steps_of
 from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.methods.choice import Poles
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.watch import End, Watch, edge, no_model, sticks
+from servoctl.model.following import instants_of
+from servoctl.model.variants import derived_near
 from servoctl.reduction.orders import other_order
 
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
@@ -118,11 +120,10 @@ class Motion:
         """Drop the samples from an instant t [s] on, and stop there for an error."""
         self.stop = error  # first: if Ctrl-C comes between the two, the same samples are cut again
         self._cut(int(np.flatnonzero(self.t == t)[0]))
-        self.steps = up_to(self.steps, self.t[-1]) if len(self.t) else []
 
     def end_after(self, t, error):
         """Drop the samples after an instant t [s], and stop there for an error."""
-        self.stop, times, self.steps = error, self.t, up_to(self.steps, t)
+        self.stop, times = error, self.t
         if len(times) > 1:
             self._cut(int(np.sum(times <= t if times[-1] > times[0] else times >= t)))
 
@@ -150,6 +151,20 @@ class Motion:
             **({"residual": row} if row else {}),
         )
         self.end_before(self.t[k], error)
+
+    def end_where_orders_change(self):
+        """Stop before the first sample at which a row has another order than the one that it was derived with."""
+        for model, t, jets in self.by_piece():
+            if not model.reduction.orders:  # which rest on no slope
+                continue
+            k, name = model.reduction.orders.first_change(instants_of(model, t), jets, model.parameters)
+            if k is not None:
+                at = float(t[k])
+                try:
+                    free = derived_near(model, at, jets[: len(model.jet_names), k]).free
+                except ServoError as error:
+                    free = error.details.get("free")
+                return self.end_before(t[k], other_order(name, at, free, model.free))
 
     def changes_pivots(self, t):
         """Note a change of pivots at t; how many were made at this instant already and did not help."""

@@ -588,11 +588,11 @@ class TaylorSteps(Stepping):
         levels = max(jets, self.top - (not by_rows))
         # more accurate than as a derivative of the series
         rates = self.rates if levels < self.top or self.doubted else None
-        return _Between(log, levels, by_rows, rates)
+        return _Expanded(log, levels, by_rows, rates)
 
 
 @frozen(eq=False)
-class _Between:
+class _Expanded:
     """Jets within the steps of a log, up to a level; γ^(s̄) by `rates`, where these are not None."""
 
     log: "_Log"

@@ -390,7 +390,16 @@ class Plant(Value, Shown):
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
 
     def sound_at(self, t, x, p):
-        """The plant, or that with the pivots `near` a state where its own are too weak to solve the equations."""
+        """The plant, or that with the pivots `near` a state where its own are too weak to solve its equations.
+
+        Parameters
+        ----------
+        t : float
+            [s]
+        x : (n_x,) array
+        p : (n_p,) array
+            As `p` gives them.
+        """
         return self if self._sound(np.array([t]), x[:, None], p[:, None])[0] else self.near(t, x)
 
     def _sound(self, t, x, p):
