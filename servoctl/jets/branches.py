@@ -221,22 +221,22 @@ def domain_edges(expressions):
 
 
 _STEEP = {
-    *(ca.OP_SQ, ca.OP_POW, ca.OP_CONSTPOW, ca.OP_SQRT, ca.OP_EXP, ca.OP_LOG, ca.OP_SINH, ca.OP_COSH, ca.OP_TANH),
+    *(ca.OP_POW, ca.OP_CONSTPOW, ca.OP_SQRT, ca.OP_EXP, ca.OP_LOG, ca.OP_SINH, ca.OP_COSH, ca.OP_TANH),
     *(ca.OP_ATAN, ca.OP_ASINH, ca.OP_ERF, ca.OP_ATAN2, ca.OP_HYPOT, ca.OP_DIV, ca.OP_INV, ca.OP_EXPM1, ca.OP_LOG1P),
 }  # not sin and cos, which are as steep everywhere
 
 
-def steep_arguments(expressions, squares=True):
-    """The arguments near whose zeros, or least magnitudes, functions in expressions may change much in a short time.
+def steep_arguments(expressions):
+    """The arguments near whose zeros functions in expressions may change much in a short time: a list of SX.
 
-    A bump exp(-(k z)²), a blend tanh(k z) or a pole 1/(z² + a²) is narrow about z = 0. Squares and whole powers, which
-    are narrow inside other functions alone, count if `squares`. Each argument is returned once.
+    A bump exp(-(k z)²), a blend tanh(k z) or a pole 1/(z² + a²) is narrow about z = 0; sines, cosines and whole powers
+    are not.
     """
     work, result = [], {}
 
     def value(op, operands):
         arguments = [work[i] for i in operands]
-        if op in _STEEP and (squares or not _whole_power(op, arguments)):
+        if op in _STEEP and not _whole_power(op, arguments):
             steep = arguments[1:] if op == ca.OP_DIV else arguments
             result.update((a.element_hash(), a) for a in steep if not a.is_constant())
         return apply_code(op, *arguments)
@@ -249,7 +249,7 @@ def _whole_power(op, arguments):
     if op in (ca.OP_POW, ca.OP_CONSTPOW) and arguments[1].is_constant():
         exponent = float(arguments[1])
         return exponent >= 0 and exponent == round(exponent)
-    return op == ca.OP_SQ
+    return False
 
 
 _SIZES = {

@@ -1,20 +1,14 @@
 """Methods with dense output: many steps at once, of which pivots, switches, residuals and equations are then inspected.
 
 A test of a step's error knows the equations at its stages alone. Therefore they are compared with the dense output at
-instants in between: quarters of each step, instants at most a thousandth of the span apart, and those at which a
-function in the equations may be narrow. Steps up to the first one that does not meet them count; the next one ends at
-that instant, so that its stages see what it stepped over.
+instants in between: quarters of each step, and instants at most a thousandth of the span apart. Steps up to the first
+one that does not meet them count; the next one ends at that instant, so that its stages see what it stepped over.
 """
-
-from contextlib import suppress
 
 import numpy as np
 
-from servoctl.dense import steps_of
-from servoctl.errors import IntegrationStopped
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
-from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import RESOLUTION, End, net
 from servoctl.values import frozen
 
@@ -124,24 +118,9 @@ class BulkSteps(Stepping):
         if self.tolerances is None:
             return len(stretch.t) - 1, None
         k, at, x, rates = self.net
-        steep = arguments(self.model)
-        if steep is not None:
-            with suppress(IntegrationStopped):  # where values that are solved for jump, which is told elsewhere
-                k, at, x, rates = self._at_centres(stretch, steep)
         h = np.diff(stretch.t)
         inside = (at != stretch.t[k]) & (at != stretch.t[k + 1]) & (np.abs(h[k]) > SHORTEST * self.watch.span)
         return self._defect(stretch, h, k[inside], at[inside], x[:, inside], rates[:, inside])
-
-    def _at_centres(self, stretch, steep):
-        """The net with the instants about zeros of steep arguments."""
-        k, at, x, rates = self.net
-        first = stretch.t[:1], stretch.x[:, :1]
-        parts = np.append(first[0], at), np.column_stack([first[1], x])
-        more = centres(steep, self.model.p, *parts, lambda s: stretch.dense(steps_of(stretch.t, s), s))
-        places = steps_of(stretch.t, more)
-        added = stretch.dense(places, more)
-        rates = np.column_stack([rates, self.f.grid(more, added, self.p)[: self.n_x]])
-        return np.append(k, places), np.append(at, more), np.column_stack([x, added]), rates
 
     def _defect(self, stretch, h, k, at, x, rates):
         rtol, atol = self.tolerances

@@ -13,10 +13,10 @@ from servoctl.codegen import compiler, emit
 from servoctl.codegen.function import TAYLOR_COMPILED, compiled
 from servoctl.codegen.native import pointer
 from servoctl.codegen.paths import combined
+from servoctl.jets.branches import steep_arguments
 from servoctl.methods.algebraic import NODES, STEPS, switched
 from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE
 from servoctl.methods.motion import breakpoints
-from servoctl.methods.narrow import steep
 from servoctl.methods.taylor import FAR_OFF, series_loop
 from servoctl.model.equations import invariant_names
 from servoctl.model.pivots import pivot_sizes
@@ -80,10 +80,19 @@ def fits(model):
     def smooth():
         f = model.function("ode").expression
         inputs = f.sx_in()
-        alone = not model.reduction.orders and switching(model) is None and not steep(model, squares=False)
+        alone = not model.reduction.orders and switching(model) is None and not _steep(model)
         return alone and not ca.depends_on(f(*inputs), inputs[0])
 
     return not (model.flat or model.paths) and model.once("fits lanes", smooth)
+
+
+def _steep(model):
+    """Whether functions in a model's equations may change much in a short time of its motions."""
+    m, program = model.reduction.mechanism, model.reduction.program
+    weights = [w for w in program.weights.values() if isinstance(w, ca.SX)]
+    rows = [*program.residuals.values(), *m.constraints.values(), *weights, *m.E.elements()]
+    found = steep_arguments([ca.SX(e) for e in (*m.balance.elements(), *rows)])
+    return any(m.q.where(symbol) is not None for a in found for symbol in ca.symvar(a))
 
 
 def integrate(model, last, span, cases, rtol, times, threads=None, progress=None):

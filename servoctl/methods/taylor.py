@@ -23,7 +23,6 @@ from servoctl.methods.choice import Project
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
-from servoctl.methods.narrow import arguments, centres
 from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
@@ -375,7 +374,7 @@ class TaylorSteps(Stepping):
 
     def _in_one_call(self, t0, x0, t1, t_eval, knots):
         """Take a motion whose steps, pivots and residuals are all in order; False if one of them must be inspected."""
-        model, watched = self.model, (self.family, self.events, arguments(self.model))
+        model, watched = self.model, (self.family, self.events)
         plain = not (self.every or self.settings.jets) and np.ndim(self.tolerances[1]) == 0
         if not plain or any(what is not None for what in watched):
             return False
@@ -538,16 +537,6 @@ class TaylorSteps(Stepping):
         each, further, _ = net(t, self.watch.span / RESOLUTION, 1)
         k = np.concatenate([np.repeat(np.arange(len(h)), len(INSIDE)), each])
         at = np.concatenate([(t[:-1, None] + INSIDE * h[:, None]).ravel(), further])
-        steep = arguments(self.model)
-        if steep is not None:
-            order = np.lexsort((at * np.sign(h[0]), k))
-            parts = np.append(t[:1], at[order]), np.append(0, k[order])
-
-            def dense(s):
-                return log.jets(steps_of(t, s), s, self.top - 1)
-
-            more = centres(steep, self.model.p, parts[0], dense(parts[0]), dense)
-            k, at = np.append(k, steps_of(t, more)), np.append(at, more)
         within = at != t[k]
         if self.knots:  # where paths have other pieces
             within &= ~np.isin(at, [end for end in t.tolist() if end in self.knots])
