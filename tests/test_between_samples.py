@@ -189,3 +189,16 @@ def test_a_force_by_the_principal_angle_jumps_where_the_angle_does(method):
         turn += 1
     x_end = middle + size * np.cos(w * (5.0 - t) - phase)
     assert run["x"][-1] == pytest.approx(x_end, abs=1e-6)
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA", "RK8"])
+def test_switches_that_follow_ever_faster_end_with_words(method):
+    """Each half swing takes sqrt(3/7) of the time of the one before; together they last for 3.377 s."""
+    q = sv.coordinates("x")
+    (x,), (dx,) = q, q.d(1)
+    plant = sv.plant(sv.Mechanism(q, sv.particle(q, 1.0, x), forces={"x": -5 * ca.sign(x) - 2 * ca.sign(dx)}))
+    with pytest.raises(sv.errors.IntegrationStopped, match="stays at the switch") as caught:
+        sv.simulate(plant, {"x": 1.0, "dx": 0.0}, (0.0, 10.0), method)
+    first, v = np.sqrt(2 / 3), np.sqrt(6.0)
+    assert caught.value.details["t"] == pytest.approx(first + v * (1 / 7 + 21**-0.5) / (1 - np.sqrt(3 / 7)), abs=5e-3)
+    assert caught.value.run.t[-1] > 3.3

@@ -17,6 +17,7 @@ from servoctl.model.following import instants_of
 from servoctl.model.variants import derived_near
 from servoctl.reduction.orders import other_order
 
+CHATTERS, CHATTERS_IN = 100, 1e-3  # switches in this part of the span: the motion stays on one, as after ever less time
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
@@ -376,6 +377,9 @@ class Stepping:
             self.motion.stop = self.monitor.singular(end.t, end.x, why) if singular else end.error
             return
         stuck, branches = self.watch.switches.stays(end)
+        often = self.motion.switches[-CHATTERS:]
+        if len(often) == CHATTERS and abs(end.t - often[0]) < CHATTERS_IN * self.watch.span:
+            stuck = stuck or [self.family.switches[i].text for i in end.switched]
         if stuck:
             self.motion.stop = sticks(self.method, end.t, stuck)
             return
