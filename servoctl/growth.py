@@ -33,7 +33,7 @@ EXPONENTIAL = 1.6  # its logarithm, relative to that over half of it: 2 for e^λ
 MOST_GROWTH = 0.8  # of the logarithm of all growth: what is exponential has it, not one swing that is followed by drift
 GREAT = 1e4  # growth that is unstable even if it is a power of time
 SHRUNK = 0.95  # of the errors of the start: with less than this left at the end, they are stable
-FEWEST, MOST = 512, 2048  # at whose ends a motion is linearised, at first and where these do not resolve the growth
+FEWEST, MOST = 512, 8192  # intervals at whose ends a motion is linearised: four times as many until they resolve growth
 AGREE = 0.02  # of 1 + ln(growth): difference of its logarithm by steps twice as long that is accepted
 JITTER, GOLDEN = 0.5, 0.6180339887498949  # of their distance by which instants are irregular, by the golden ratio
 ASIDE = 1e-10  # of the span and of the instant: distance on both sides of a knot, where the linearisation may jump
@@ -216,7 +216,8 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
     Notes
     -----
     The motion is linearised at the ends of 512 intervals or a few more, on both sides of breaks of its paths, whatever
-    its samples. The growth counts if that by intervals twice as long agrees; otherwise 2048 intervals are tried.
+    its samples. The growth counts if that by intervals twice as long agrees; otherwise 2048 and 8192 intervals are
+    tried, shorter ones where the linearisation is large.
     """
     model = require_run(run, "internal_dynamics")
     if model.flat:
@@ -409,20 +410,23 @@ def _knots(run, t1):
     return np.array(breakpoints((run.span[0], t1), run.knots)[1:-1])
 
 
-def _instants(run, t1, count):
+def _instants(run, t1, count, part=None, at=None):
     """Ends of `count` intervals of a run up to t1, or more: of four at least from a knot to the next, and around it.
 
-    Instants at equal distances would see a periodic linearisation at one phase only. They are closer together towards
-    the end of a motion that stopped, where its rates may have no bound.
+    They are as many in equal parts of the time; or of what has the increasing values `part` (K,) at instants `at` (K,).
+    Instants at equal distances would see a periodic linearisation at one phase only.
     """
     t0, knots = run.span[0], _knots(run, t1)
     beside = ASIDE * (np.abs(knots) + abs(t1 - t0)) * np.sign(t1 - t0)
     ends = np.concatenate([[t0], np.column_stack([knots - beside, knots + beside]).ravel(), [t1]])
-    shares = np.abs(np.diff(ends)) / (abs(t1 - t0) or 1.0)
-    parts = [_irregular(4 * max(1, round(count / 4 * share))) for share in shares]
-    if run.status < 0:
-        parts[-1] = 1 - (1 - parts[-1]) ** 2
-    pieces = [a + (b - a) * part[:-1] for a, b, part in zip(ends[:-1], ends[1:], parts, strict=True)]
+    if part is None:
+        part, at = np.array([0.0, 1.0]), np.array([t0, t1])
+    way, at = np.interp(np.abs(ends - t0), np.abs(at - t0), part), np.abs(at - t0)
+    pieces = []
+    for a, b, first, last in zip(ends[:-1], ends[1:], way[:-1], way[1:], strict=True):
+        between = _irregular(4 * max(1, round(count / 4 * (last - first) / part[-1])))
+        time = np.interp(first + (last - first) * between, part, at)
+        pieces.append(a + (b - a) * (time[:-1] - time[0]) / (np.ptp(time) or 1.0))
     return np.append(np.concatenate(pieces), t1)
 
 
@@ -435,17 +439,32 @@ def _irregular(count):
 
 
 def _propagated(model, run, t1):
-    """Tangents along a run up to t1, and, if enough to resolve the growth, steps along them and propagators."""
-    for count in (FEWEST, MOST):
-        tangents = _tangents(model, run, _instants(run, t1, count)).in_fours()
+    """Tangents along a run up to t1, and, if enough to resolve the growth, steps along them and propagators.
+
+    Where equal intervals do not, shorter ones are taken where the linearisation was found to be large.
+    """
+    count, known = FEWEST, ()
+    while count <= MOST:
+        tangents = _tangents(model, run, _instants(run, t1, count, *known)).in_fours()
         steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
-        if steps is None or longer is None:
-            continue
-        ends = _block_ends(tangents.t[::2])
-        propagators = _propagators(steps, ends)
-        if _agree(propagators, _propagators(longer, ends[ends % 2 == 0] // 2)):
-            return tangents, steps, propagators
+        if steps is not None and longer is not None:
+            ends = _block_ends(tangents.t[::2])
+            propagators = _propagators(steps, ends)
+            if _agree(propagators, _propagators(longer, ends[ends % 2 == 0] // 2)):
+                return tangents, steps, propagators
+        large = _large(tangents)
+        if not 0 < large[-1] < np.inf:  # as of a single instant
+            break
+        count, known = 4 * count, (large, tangents.t)
     return (tangents,)
+
+
+@np.errstate(all="ignore")
+def _large(tangents):
+    """Values at the instants of tangents that increase with the time and with the way of Nᵀ J N, half by each."""
+    time, size = np.abs(np.diff(tangents.t)), _frobenius(tangents.frozen)
+    way = time * (size[1:] + size[:-1]) / 2
+    return np.append(0.0, np.cumsum(time / time.sum() + way / max(way.sum(), TINY)))
 
 
 def _agree(propagators, longer):

@@ -372,10 +372,10 @@ def test_a_stopped_motion_carries_the_verdict_too():
 
 
 def test_what_swings_too_often_is_inconclusive():
-    """Along a thousand periods of the linearisation, two instants in each tell nothing."""
-    run, found = moved(passive(lambda x, v, t: -0.1 * v - (1 + 200 * ca.cos(50 * t)) * x), 120.0)
+    """Along five thousand periods of the linearisation, two instants in each tell nothing."""
+    run, found = moved(passive(lambda x, v, t: -0.1 * v - (1 + 5e3 * ca.cos(250 * t)) * x), 120.0)
     assert found.verdict == run.internal["verdict"] == "inconclusive" and np.isnan(found.growth)
-    assert "2048 intervals" in repr(found) and "a shorter time" in repr(found)
+    assert "8192 intervals" in repr(found) and "a shorter time" in repr(found)
     assert sv.internal_dynamics(moved(run.model, 5.0)[0]).verdict != "inconclusive"
 
 
