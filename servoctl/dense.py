@@ -10,6 +10,7 @@ from numpy.polynomial import chebyshev
 from servoctl.model.jets import with_highest
 from servoctl.values import frozen
 
+INEXACT = ("relaxed",)  # methods whose motions miss the program, so that its equations do not give the accelerations
 DISTINCT = 1e-6  # of the mean distance of samples: between nearer ones polynomials are rounding
 NODES = 9  # of the polynomial by which a signal is known within an interval: pulses of a tenth of it are seen
 PROBES = np.array([-0.611, 0.137])  # where it is compared with the signal; on no symmetry of the nodes
@@ -120,7 +121,7 @@ def between(run):
         distinct = np.append(np.abs(np.diff(t)) > apart, True)
         if distinct.sum() > 1:
             t, jets = t[distinct], jets[:, distinct]
-            pieces.append(Dense(model, t, Hermite(model, t, jets)))
+            pieces.append(Dense(model, t, Hermite(model, t, jets, exact=run.method not in INEXACT)))
     return tuple(pieces)
 
 

@@ -407,7 +407,9 @@ def _grid(interpreter, t, x, p):
 
 def _knots(run, t1):
     """Knots (K,) within a run up to t1, in its direction."""
-    return np.array(breakpoints((run.span[0], t1), run.knots)[1:-1])
+    ends, inside = (run.span[0], t1), np.array(breakpoints((run.span[0], t1), run.knots)[1:-1])
+    near = 2 * ASIDE * (np.abs(inside) + abs(t1 - run.span[0]))
+    return inside[np.abs(np.subtract.outer(ends, inside)).min(axis=0) > near]
 
 
 def _instants(run, t1, count, part=None, at=None):

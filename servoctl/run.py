@@ -418,7 +418,7 @@ class Run(Sampled, Value):
         return np.clip(times, low, high)
 
     def extrema(self, name: str) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The least and the greatest value of a signal, between samples, too.
+        """The least and the greatest value of a signal, between samples, too; of a run without its model, at them.
 
         Parameters
         ----------
@@ -431,9 +431,7 @@ class Run(Sampled, Value):
         """
         values = self[name]
         if self.model is None or len(self.t) < 2:
-            known = np.flatnonzero(np.isfinite(values))
-            ends = (known[np.argmin(values[known])], known[np.argmax(values[known])]) if len(known) else ()
-            return tuple((float(self.t[k]), float(values[k])) for k in ends) or ((float(self.t[0]), np.nan),) * 2
+            return extremes(lambda t: np.full(len(t), np.nan), np.sort(self.t[[0, -1]]), self.t, values, 0.0)
         forward = 1 if self.t[-1] >= self.t[0] else -1
         low, high = sorted((self.t[0], self.t[-1]))
         ends = [piece.t for piece in self._pieces] or [self.t]

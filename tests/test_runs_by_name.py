@@ -40,7 +40,7 @@ def test_a_run_is_loaded_with_its_model(run, tmp_path):
     assert sv.verify(loaded).passed
     plant = sv.plant(model.reduction.mechanism)
     law, other = (sv.lqr(plan, plant, rate=100) for plan in (run, loaded))
-    assert np.array_equal(law.schedule, other.schedule)
+    assert other.schedule == pytest.approx(law.schedule, rel=1e-9, abs=1e-9)  # a loaded plan has its samples alone
     assert sv.load(path).model is None and sv.load(path).start == run.start
 
 

@@ -79,9 +79,9 @@ def test_a_model_that_travelled_takes_other_numbers_and_other_pivots(crane):
     t, jets = plan.t[5], plan.jets[:, 5]
     for change in (lambda m: m.with_parameters(m_load=50.0), lambda m: derived_near(m, t, jets)):
         here, far = change(model), change(again(model))
-        assert here == far
+        assert here.numbers == far.numbers
         values = [m.signals("actuation")[1](t, jets, m.p) for m in (here, far)]
-        assert np.array_equal(*values)
+        assert values[0] == pytest.approx(values[1], rel=1e-12)  # by pivots that either chose
 
 
 def test_a_plant_that_travelled_is_equal_and_computes_the_same_bits(crane):
