@@ -8,9 +8,11 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from servoctl.model.jets import with_highest
+from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
 INEXACT = ("relaxed",)  # methods whose motions miss the program, so that its equations do not give the accelerations
+MISSES = 1e-2  # of the largest rates: what polynomials may miss them by over an interval of samples
 DISTINCT = 1e-6  # of the mean distance of samples: between nearer ones polynomials are rounding
 NODES = 9  # of the polynomial by which a signal is known within an interval: pulses of a tenth of it are seen
 PROBES = np.array([-0.611, 0.137])  # where it is compared with the signal; on no symmetry of the nodes
@@ -73,9 +75,10 @@ class Hermite:
             f = self.model.signals("coordinate_rates")[1]
             rates = f.grid(self.t, z[: f.n_x], self.model.p)
             found = [*_matched([z[:nq], rates[:nq], rates[nq:]], *place)[:1], *_matched(levels, *place)]
+        jets, n_x = np.vstack(found), len(self.model.state_names)
         if self.exact:
-            found[-1] = with_highest(self.model, times, np.vstack(found[:-1]), p)[-n:]
-        return np.vstack(found)
+            jets[: n_x + n] = with_highest(self.model, times, jets[:n_x], p)
+        return jets
 
 
 def _matched(derivatives, t, i, times):
@@ -125,6 +128,21 @@ def between(run):
     return tuple(pieces)
 
 
+def resolved(run):
+    """Whether the polynomials between the samples of a run have the accelerations that its equations give there."""
+    if run.method in INEXACT:
+        return True
+    pieces = between(run) if run.model is not None and np.isfinite(run.jets).all() else ()
+    for piece in pieces:
+        middle, h, n = (piece.t[1:] + piece.t[:-1]) / 2, np.abs(np.diff(piece.t)), piece.model.n
+        curve = replace(piece.jets, exact=False)(np.arange(len(h)), middle, piece.model.p)
+        n_x = len(piece.model.state_names)
+        off = np.abs(curve[n_x : n_x + n] - with_highest(piece.model, middle, curve[:n_x])[n_x : n_x + n])
+        if not (h * off).max() <= MISSES * np.abs(curve[n_x - n : n_x]).max(initial=TINY):
+            return False
+    return bool(pieces)
+
+
 def piece_of(pieces, t):
     """Which of the pieces holds at each instant (N,): where one ends and the next begins, the one that ends."""
     forward = 1.0 if pieces[-1].t[-1] >= pieces[0].t[0] else -1.0
@@ -158,6 +176,11 @@ def jets_at(pieces, t):
     return jets
 
 
+def extremes_at(t, known):
+    """The least and the greatest of values (N,) at t (N,), as `extremes`."""
+    return tuple(_farthest((float(t[0]), np.nan), t, known, sign) for sign in (-1.0, 1.0))
+
+
 @np.errstate(all="ignore")
 def extremes(value, cuts, t, known, size):
     """The least and the greatest value of a signal, ((t, value), (t, value)); NaN where it has no finite one.
@@ -165,7 +188,7 @@ def extremes(value, cuts, t, known, size):
     `value` gives it at ascending instants (N,), between the ascending `cuts` it is smooth, and at samples t (N,) it has
     the `known` values. `size` is that of signals of its kind.
     """
-    found = [_farthest((float(t[0]), np.nan), t, known, sign) for sign in (-1.0, 1.0)]
+    found = list(extremes_at(t, known))
 
     def look(curve, a, b, instants, y):
         found[:] = [_farthest(found[i], instants.ravel(), y.ravel(), sign) for i, sign in enumerate((-1.0, 1.0))]
@@ -173,6 +196,8 @@ def extremes(value, cuts, t, known, size):
         error, bounds = curve.judged(y)
         beyond = np.array([bounds[0] < low, bounds[1] > high]) & np.isfinite(error)
         rough = beyond.any(axis=0) & (error > FITS * (high - low) + AS_ZERO * size)
+        known = np.isfinite(y)
+        rough |= known.any(axis=1) & ~known.all(axis=1)  # where it has an end
         for i, sign in enumerate((-1.0, 1.0)):
             last = np.flatnonzero(beyond[i] & ~rough)
             last = last[np.argsort(sign * bounds[i, last])[-CANDIDATES:]]
@@ -185,10 +210,11 @@ def extremes(value, cuts, t, known, size):
 
 
 @np.errstate(all="ignore")
-def one_sign_apart(value, edges):
+def one_sign_apart(value, edges, floor=0.0):
     """Ascending instants, the `edges` among them, between which a signal has at most one zero.
 
-    They are where polynomials through its values turn. `value` gives it at ascending instants (N,).
+    They are where polynomials through its values turn. `value` gives it at ascending instants (N,); what is below the
+    `floor` is rounding.
     """
     found, size = [edges], 0.0
 
@@ -197,7 +223,7 @@ def one_sign_apart(value, edges):
         size = np.nanmax(np.abs(y), initial=size)
         error, (low, high) = curve.judged(y)
         near = (low <= 0) & (high >= 0) & np.isfinite(error)
-        rough = near & (error > FITS * size) & (b - a > LEAST_PART * (edges[-1] - edges[0]))
+        rough = near & (error > FITS * size + floor)
         found.extend(curve.turns(a[k], b[k], y[k]) for k in np.flatnonzero(near & ~rough))
         found.append((a[rough] + b[rough]) / 2)
         return rough
@@ -221,6 +247,7 @@ def _refined(value, edges, look):
         instants = curve.instants(a, b)
         y = value(instants.ravel()).reshape(instants.shape)
         rough, probed = look(curve, a, b, instants, y), probed + y.size
+        rough &= b - a > LEAST_PART * (edges[-1] - edges[0])
         middle = (a[rough] + b[rough]) / 2
         a, b = np.sort(np.append(a[rough], middle)), np.sort(np.append(middle, b[rough]))
 

@@ -41,11 +41,16 @@ TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
+FEW, TOLD = (
+    64,
+    0.3,
+)  # intervals that may tell that there is nothing to warn of; what longer ones may change ln(growth) by
 GLANCES = 128  # intervals by which these instants are spread over the way of the states
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
 PERIODIC = 1e-3  # of the largest linearisation: its change over a period that is accepted
+UNRESOLVED = "the samples do not resolve it, and its steps are not known; simulate with more samples (t_eval)"
 NEAR_ONE = 1e-3  # of a multiplier: within this of 1 it is neutral
 
 
@@ -223,6 +228,9 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
     if model.flat:
         return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
     t0, t1 = run.span
+    if not run.resolved:
+        nothing = _tangents(model, run, run.t[:1])
+        return InternalDynamics(nothing, "inconclusive", np.nan, np.nan, cause=UNRESOLVED)
     end = None if period is None else _end_of_first(positive("period", period), t0, t1)
     tangents, *resolved = _propagated(model, run, t1)
     if switch := stays_on_switch(model, run):
@@ -277,6 +285,22 @@ def _spread(t, x, knots):
         return samples
     pieces = np.searchsorted(np.abs(knots - t[0]), np.abs(t - t[0]))
     return np.union1d(samples, np.flatnonzero(~np.isin(pieces, pieces[samples])))
+
+
+def quiet(run):
+    """Whether a run's internal dynamics need no warning: by a bound of the growth, or by few propagators."""
+    if growth_bound(run.model, run) <= UNSTABLE:
+        return True
+    tangents = _tangents(run.model, run, _instants(run, run.span[1], FEW)).in_fours()
+    steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
+    if steps is None or longer is None:
+        return False
+    corners = tangents[::2]
+    ends = _block_ends(corners.t)
+    propagators = _propagators(steps, ends)
+    coarse = _propagators(longer, ends[ends % 2 == 0] // 2)
+    told = abs(propagators[2].max() - coarse[2].max()) <= TOLD
+    return bool(told and not _unstable(corners, steps, *_growth(corners, propagators)))
 
 
 def _largest_integral(t, mu):

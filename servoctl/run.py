@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from servoctl import archive
 from servoctl.checks import antiderivative, as_numbers, finite, named, require_kind, rows_read, whole
-from servoctl.dense import between, extremes, jets_at, piece_of
+from servoctl.dense import between, extremes, extremes_at, jets_at, piece_of, resolved
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
 from servoctl.model.equations import residual_names, signal_groups
@@ -364,9 +364,16 @@ class Run(Sampled, Value):
         Raises
         ------
         SpecificationError
-            As by `at`.
+            As by `at`, and for instants in another order.
         """
         jets, times = self.at(np.atleast_1d(t)), self._within(t)
+        if (np.diff(times) * (self.span[1] - self.span[0]) < 0).any():
+            raise SpecificationError(
+                "Instants were given in another order than that of the run.",
+                "Samples follow each other as the motion does.",
+                do="Sort them, backwards for a run that goes backwards.",
+                span=self.span,
+            )
         ranges = [(int(np.argmax(inside)), int(inside.sum()), model) for model, inside in self.by_model(times)]
         variants = tuple((first, first + count, model) for first, count, model in ranges) if self.variants else ()
         return replace(self, t=times, jets=jets, variants=variants, stored={}, stored_residual={})
@@ -400,6 +407,11 @@ class Run(Sampled, Value):
         """The steps of the run, or what passes through its samples."""
         return self.steps or between(self)
 
+    @cached_property
+    def resolved(self):
+        """Whether the motion is known between its samples: by its steps, or as these are dense enough."""
+        return bool(self.steps) or resolved(self)
+
     def _within(self, t):
         """Instants (N,) of the run, without what rounding lets them exceed it."""
         times = np.atleast_1d(finite("t", t, "time") if np.ndim(t) == 0 else as_numbers(t))
@@ -418,7 +430,9 @@ class Run(Sampled, Value):
         return np.clip(times, low, high)
 
     def extrema(self, name: str) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The least and the greatest value of a signal, between samples, too; of a run without its model, at them.
+        """The least and the greatest value of a signal from the first to the last sample, between samples, too.
+
+        A run that was loaded without its model, or with few samples, has those of its samples.
 
         Parameters
         ----------
@@ -430,8 +444,8 @@ class Run(Sampled, Value):
             Minimum and maximum of the finite values; NaN if there are none.
         """
         values = self[name]
-        if self.model is None or len(self.t) < 2:
-            return extremes(lambda t: np.full(len(t), np.nan), np.sort(self.t[[0, -1]]), self.t, values, 0.0)
+        if self.model is None or len(self.t) < 2 or not self.resolved:
+            return extremes_at(self.t, values)
         forward = 1 if self.t[-1] >= self.t[0] else -1
         low, high = sorted((self.t[0], self.t[-1]))
         ends = [piece.t for piece in self._pieces] or [self.t]
@@ -532,23 +546,6 @@ def range_in_words(name, low, t_low, high, t_high, unit):
     low, high = (f"{digits(value)} {unit}".rstrip() for value in (low, high))
     at_low, at_high = ("" if np.isnan(t) else f" (t = {t:.4g} s)" for t in (t_low, t_high))
     return f"  {name}: {low} throughout" if low == high else f"  {name}: {low}{at_low} .. {high}{at_high}"
-
-
-def _hermite_between(levels, i, s, h):
-    """Values at s (N,) within intervals i of lengths h (N,), of values with derivatives at samples."""
-    from math import factorial
-
-    count = len(levels)
-    powers = np.arange(2 * count)
-    derivative = np.array([[factorial(p) / factorial(p - k) if p >= k else 0.0 for p in powers] for k in range(count)])
-
-    def at(s, k):
-        return derivative[k] * np.power.outer(s, np.maximum(powers - k, 0))
-
-    system = np.array([*(at(0.0, k) for k in range(count)), *(at(1.0, k) for k in range(count))])
-    ends = [level[:, j] * h**k for j in (i, i + 1) for k, level in enumerate(levels)]
-    c = np.tensordot(np.linalg.inv(system), np.stack(ends), 1)  # (2 count, n, N)
-    return np.einsum("Np,pnN->nN", at(s, 0), c)
 
 
 class _Residuals(Mapping):

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from servoctl.checks import as_numbers, as_span, within
 from servoctl.dense import up_to
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, warn
-from servoctl.growth import STEP_ERROR, UNSTABLE, growth_bound, internal_dynamics
+from servoctl.growth import STEP_ERROR, internal_dynamics, quiet
 from servoctl.methods.accuracy import (
     ATOL,
     absolute_tolerances,
@@ -169,13 +169,13 @@ def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t
     smoother = SMOOTHER if isinstance(method, Algebraic) else method.order if isinstance(method, RungeKutta) else np.inf
     knots = breaks_within(model, span, smoother)
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
-    bar, problem = Progress(span, progress), (t0, x0, t1, times, _ends_of_steps(knots, span, max_step), events)
+    bar, problem = Progress(span, progress), (t0, x0, t1, times, _ends_of_steps(knots, span, max_step, method), events)
     try:
         motion = _tolerant(model, method, drift, problem, bar)
     except Unsuited as unsuited:
         method = unsuited.method
         motion = _tolerant(model, method, drift, problem, bar)
-        motion.note = f"by {method}, since {unsuited}"
+        motion.say(f"by {method}, since {unsuited}")
     finally:
         bar.close()
 
@@ -195,10 +195,17 @@ def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t
     return run
 
 
-def _ends_of_steps(knots, span, max_step):
+def _ends_of_steps(knots, span, max_step, method):
     """The knots, with as many further instants as steps need to be no longer than `max_step` [s]; None for any."""
     if max_step is None:
         return knots
+    if isinstance(method, Bounded):
+        raise SpecificationError(
+            f"max_step={max_step!r} was given with method='bounded'.",
+            "A bounded motion is solved for on a mesh of its own, which is refined until its defect is small.",
+            do="Leave it out, or take another method.",
+            max_step=max_step,
+        )
     length = abs(span[1] - span[0])
     count = np.ceil(length / within("max_step", max_step, least=length / MOST_ENDS, above=0.0))
     return tuple(np.union1d(knots, np.linspace(*span, int(count) + 1)[1:-1]).tolist())
@@ -248,12 +255,12 @@ def _has_internal_dynamics(model):
 def judged(run, tolerance=STEP_ERROR):
     """A run that gives the verdict on its internal dynamics when it is read; warns at once if they are unstable.
 
-    Most motions need no propagators to know that there is nothing to warn of: a bound of the growth tells. Whoever
-    interrupts a motion does not wait. `tolerance` is the relative error of a step of the run's method.
+    Most motions need few propagators, or none, to know that there is nothing to warn of. Whoever interrupts a motion
+    does not wait. `tolerance` is the relative error of a step of the run's method.
     """
     later = run.with_verdict(partial(_verdict, tolerance=tolerance))
     try:
-        if not run.success or growth_bound(run.model, run) <= UNSTABLE:
+        if not run.success or quiet(run):
             return later
         known = later.with_verdict(dict(later.internal))
     except KeyboardInterrupt:
@@ -375,15 +382,17 @@ def _run(model, motion, settings, start, t1):
     elif motion.ended:
         status, message = 1, f"ended by the event {motion.ended!r} at t = {t[-1]:.9g} s"
     else:
-        status, message = 0, f"finished; {motion.note}" if motion.note else "finished"
+        status, message = 0, "finished"
+    message += f"; {motion.note}" if motion.note and motion.stop is None else ""
     facts = {"method": str(method), "drift": str(drift or ""), "counters": motion.counters}
     facts["knots"] = tuple(sorted({*knots, *motion.switches}))
     facts["variants"] = tuple(motion.variants())
     if isinstance(method, Taylor):
         _set_at_knots(t, jets, facts["variants"], knots)
-    facts["events"] = occurrences(motion.occurrences, partial(jet_names_to, model))
     facts |= {"success": status == 0 or bool(motion.ended), "status": status, "message": message}
-    facts["steps"] = tuple(motion.steps if motion.stop is None else up_to(motion.steps, t[-1]))
+    steps = facts["steps"] = tuple(motion.steps if motion.stop is None else up_to(motion.steps, t[-1]))
+    found = occurrences(motion.occurrences, partial(jet_names_to, model))
+    facts["events"] = {name: replace(at, steps=steps) for name, at in found.items()}
     return Run(t, jets, jet_names_to(model, len(jets)), model, start=start, **facts)
 
 

@@ -89,18 +89,32 @@ def crane_plans():
     return few, many, sv.plant(model.reduction.mechanism)
 
 
+def swinging():
+    """A pendulum on a cart that moves, 20 s from 2.9 rad: three samples tell nothing of it."""
+    model = particle(lambda q: ca.sin(q.t), lambda q: -40 * ca.sin(q[1]) - 0.8 * q.d(1)[1] + 0.02 * (q[0] - q[1]))
+    return model, model.start(y=2.9, dy=0.0)
+
+
 def test_a_saved_run_has_its_samples_alone(tmp_path):
     model = particle(lambda q: ca.sin(3 * q.t))
     run = simulated(model, t_eval=np.linspace(0.0, 1.0, 101))
     again = sv.load(run.save(tmp_path / "run"), model)
     assert again.steps == () and again.at(0.123) == pytest.approx(run.at(0.123), abs=1e-9)
+    assert again.extrema("F")[1] == pytest.approx(run.extrema("F")[1], abs=1e-6)
 
 
-def test_steps_that_would_fill_the_memory_are_not_kept(monkeypatch):
+def test_samples_that_do_not_resolve_a_motion_tell_nothing_of_it(tmp_path, monkeypatch):
+    model, start = swinging()
+    run = sv.simulate(model, start, (0.0, 20.0), t_eval=np.linspace(0.0, 20.0, 3))
+    again = sv.load(run.save(tmp_path / "run"), model)
+    assert run.internal["verdict"] != "inconclusive" and run.extrema("y")[1][1] == pytest.approx(2.9, abs=1e-9)
     monkeypatch.setattr("servoctl.methods.motion.MOST_KEPT", 100.0)
-    run = simulated(particle(lambda q: ca.sin(3 * q.t)), t_eval=np.linspace(0.0, 1.0, 101))
-    assert run.steps == () and run.at(0.123)[0] == pytest.approx(np.sin(0.369), abs=1e-9)
-    assert "between samples" in run.details
+    unkept = sv.simulate(model, start, (0.0, 20.0), t_eval=np.linspace(0.0, 20.0, 3))
+    for other in (again, unkept):
+        assert other.steps == () and other.extrema("y")[1] == (0.0, 2.9)
+        found = sv.internal_dynamics(other)
+        assert found.verdict == "inconclusive" and "more samples" in found.cause
+    assert "interpolated between samples" in unkept.message
 
 
 @pytest.mark.parametrize("method", ["DOP853", "RK45", "Radau"])
@@ -202,3 +216,50 @@ def test_switches_that_follow_ever_faster_end_with_words(method):
     last = np.sqrt(2 / 3) + np.sqrt(6.0) * (1 / 7 + 21**-0.5) / (1 - np.sqrt(3 / 7))
     assert last - 0.03 < caught.value.details["t"] < last + 5e-3
     assert caught.value.run.t[-1] > 3.3
+
+
+def test_a_signal_that_jumps_costs_no_search_without_end():
+    q = sv.coordinates("x")
+    (x,) = q
+    outputs = {"jump": ca.if_else(x > 0.3, 1, 0), "edge": ca.sqrt(x - 0.5)}
+    mechanism = sv.Mechanism(q, sv.particle(q, 1.0, x), actuators={"F": x}, outputs=outputs)
+    model = sv.derive(mechanism, sv.Program({"X": x - ca.sin(q.t)}))
+    run, calls = sv.simulate(model, model.start(), (0.0, 1.0), t_eval=[0.0, 1.0]), []
+    counted = type(run).sampled
+    type(run).sampled = lambda self, t: calls.append(len(t)) or counted(self, t)
+    try:
+        assert [value for _, value in run.extrema("jump")] == [0.0, 1.0]
+        assert run.extrema("edge")[0][1] == pytest.approx(0.0, abs=1e-4)
+    finally:
+        type(run).sampled = counted
+    assert sum(calls) < 20_000
+
+
+def test_what_ends_a_motion_ends_what_is_known_of_it():
+    model = particle(lambda q: ca.sin(q.t))
+    for method in (None, "DOP853", "RK8"):
+        event = {"end": sv.Event("y", 0.5, terminal=True)}
+        run = sv.simulate(model, model.start(guess={"y": 1.0}), (0.0, 3.0), method, events=event, t_eval=[0.0, 0.5, 3.0])
+        assert run.status == 1 and run.span == (0.0, run.t[-1])
+        with pytest.raises(sv.errors.SpecificationError, match="outside the run"):
+            run.at(run.t[-1] + 0.1)
+        assert run.events["end"].at(0.2) == pytest.approx(run.at(0.2))
+
+
+def test_instants_in_another_order_are_refused():
+    run = simulated(particle(lambda q: ca.sin(q.t)))
+    with pytest.raises(sv.errors.SpecificationError, match="another order"):
+        run.sampled([0.5, 0.2])
+
+
+@pytest.mark.parametrize("method", ["LSODA", "Radau"])
+def test_no_implicit_method_is_told_that_stability_limits_it(method):
+    model = pair(0.1, 2e4)
+    run = sv.simulate(model, model.start(guess={"b": 0.0}), (0.0, 2.0), method, t_eval=[0.0, 2.0])
+    assert run.message == "finished"
+
+
+def test_a_bounded_motion_takes_no_longest_step(gallery_model):
+    model = gallery_model("cart-pole")
+    with pytest.raises(sv.errors.SpecificationError, match="max_step"):
+        sv.simulate(model, model.start(), (0.0, 2.0), "bounded", max_step=0.1)

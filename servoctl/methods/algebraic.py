@@ -185,7 +185,7 @@ class _Algebraic(Stepping):
         if found is not None:
             x, top = np.split(found.jets[:, None], [len(self.model.state_names)])
             self.pending = self.pending[self.direction * self.pending < self.direction * found.t]
-            self._sample(nodes, x[:, 0], end, end)
+            self._sample(nodes, x[:, 0], min(self.direction * found.t, self.direction * end) * self.direction, None)
             self.motion.add(self.model, [found.t], x, top)
             self.motion.ended = found.name
         return found is not None

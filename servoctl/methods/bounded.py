@@ -92,9 +92,9 @@ def bounded(model, span, guess, method, instants, progress, events=None):
     outputs = model.function("ode").grid(times, samples, model.p)
     problem.require_pivots(times, outputs[problem.n_x :])
     motion.add(model, times, samples, outputs[problem.n_x - model.n : problem.n_x])
-    motion.keep(model, mesh, _OnMesh(problem, mesh, x))
-    motion.note = f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s{left_out}; "
-    motion.note += f"a window of twice the length changes the motion by {truncation:.1e}"
+    motion.keep(model, mesh, _OnMesh(problem, mesh, x), (), times[-1] if motion.ended else None)
+    motion.say(f"bounded from t = {window[0]:.4g} to {window[1]:.4g} s{left_out}")
+    motion.say(f"a window of twice the length changes the motion by {truncation:.1e}")
     return motion
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from servoctl.checks import as_list, finite, mapping, whole
-from servoctl.dense import one_sign_apart, parted
+from servoctl.dense import AS_ZERO, one_sign_apart, parted
 from servoctl.errors import SpecificationError
 from servoctl.model.jets import jet_names_to
 from servoctl.run import Run
@@ -149,7 +149,8 @@ class Events:
                 return self._along(event, model, t, jets_at(t))
 
             elapsed = self.forward * (ends - self.start)
-            s = one_sign_apart(value, parted(elapsed, self.length)) if len(ends) > 1 else elapsed
+            floor = AS_ZERO * np.abs(jets_at(ends)[: model.nq]).max(initial=0.0) * isinstance(event.signal, str)
+            s = one_sign_apart(value, parted(elapsed, self.length), floor) if len(ends) > 1 else elapsed
             g = value(s)
             s, g = s[np.isfinite(g)], g[np.isfinite(g)]
             g = _with_start(g) if s[:1] == 0 else g

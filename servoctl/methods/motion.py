@@ -19,7 +19,7 @@ from servoctl.reduction.orders import other_order
 
 CHATTERS, CHATTERS_IN = 100, 1e-3  # switches in this part of the span: the motion stays on one, as after ever less time
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
-DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and extrema refined to rounding
+DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and as many as figures show
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
 MOST_KEPT = 200e6  # bytes of steps: beyond them a motion is known at its samples alone
@@ -100,7 +100,11 @@ class Motion:
         self.kept += self.steps[-1].nbytes
         if self.kept > MOST_KEPT:
             self.steps, self.kept = [], np.inf
-            self.note = f"interpolated between samples, as its steps take more than {MOST_KEPT / 1e6:g} MB"
+            self.say(f"interpolated between samples, as its steps take more than {MOST_KEPT / 1e6:g} MB")
+
+    def say(self, what):
+        """Add what the message of the run says."""
+        self.note = "; ".join(dict.fromkeys([*filter(None, self.note.split("; ")), what]))
 
     def _reserve(self, room, rows):
         """Make room for samples; the system gives memory as they fill it."""

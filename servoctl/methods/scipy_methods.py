@@ -8,6 +8,7 @@ from servoctl.methods.taylor import leave_if_stiff
 from servoctl.methods.watch import edge
 from servoctl.values import frozen
 
+OBJECTS = 700  # bytes that scipy's dense output of a step takes beside its coefficients
 AT_ONCE = 16  # steps that are inspected together, at most: twice as many each time
 MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
 
@@ -20,8 +21,8 @@ class Solved(Steps):
 
     @property
     def nbytes(self):
-        """Memory of the steps: the coefficients of polynomials of a degree up to 8."""
-        return 8 * self.x.nbytes
+        """Memory of the steps: coefficients of polynomials of a degree up to 8, and objects about them."""
+        return 8 * self.x.nbytes + OBJECTS * len(self.dense)
 
     def at(self, k, times):
         """States (n_x, N) at times (N,) within steps k (N,)."""

@@ -19,7 +19,7 @@ from servoctl.codegen.paths import BY_INSTANT
 from servoctl.dense import steps_of
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
-from servoctl.methods.choice import Project
+from servoctl.methods.choice import EXPLICIT, Project
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
@@ -317,13 +317,16 @@ def leave_if_stiff(steps, method, limit, t, x):
 
     Without a method the motion says so.
     """
+    if method is None and steps.method not in ("Taylor", *EXPLICIT):
+        return
     length, p = abs(t[-1] - t[0]) / (len(t) - 1), steps.model.p
     forward, mean = np.copysign(steps.watch.span, t[-1] - t[0]), np.array([length])
     if stiff(steps.model, t[-1:], x[:, None], p[:, None], mean, forward, limit)[0]:
         why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
         if method is not None:
             raise Unsuited(why, method)
-        steps.motion.note = f"{why}, and its forces may err by far: try method='RadauIIA'"
+        if "stability" not in steps.motion.note:
+            steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
 
 
 def stiff(model, t, x, p, steps, span, limit):

@@ -383,9 +383,12 @@ class Plant(Value, Shown):
         x, u = array_of("x", x, self.n_x, len(t)), array_of("u", u, len(self.inputs), len(t))
         p = self.p(u)
         y, weak = self.function("jacobian").grid(t, x, p), ~self._sound(t, x, p)
-        if weak.any():
+        while weak.any():
             k = int(np.argmax(weak))
-            y[:, weak] = self.near(t[k], x[:, k]).function("jacobian").grid(t[weak], x[:, weak], p[:, weak])
+            other = self.near(t[k], x[:, k])
+            sound = weak & other._sound(t, x, p)
+            sound[k] = True  # no other pivots are better there
+            y[:, sound], weak = other.function("jacobian").grid(t[sound], x[:, sound], p[:, sound]), weak & ~sound
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]
 
