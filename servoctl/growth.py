@@ -41,7 +41,7 @@ TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
-FEW, TOLD = (
+AT_FIRST, TOLD = (
     64,
     0.3,
 )  # intervals that may tell that there is nothing to warn of; what longer ones may change ln(growth) by
@@ -50,7 +50,7 @@ SHARED = 0.5  # of the largest part that is independent of states chosen before:
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
 STEP_ERROR = 1e-9  # of the steps of a motion, unless its method has another
 PERIODIC = 1e-3  # of the largest linearisation: its change over a period that is accepted
-UNRESOLVED = "the samples do not resolve it, and its steps are not known; simulate with more samples (t_eval)"
+FEW_SAMPLES = "the samples do not resolve it, and its steps are not known; simulate with more samples (t_eval)"
 NEAR_ONE = 1e-3  # of a multiplier: within this of 1 it is neutral
 
 
@@ -230,7 +230,7 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
     t0, t1 = run.span
     if not run.resolved:
         nothing = _tangents(model, run, run.t[:1])
-        return InternalDynamics(nothing, "inconclusive", np.nan, np.nan, cause=UNRESOLVED)
+        return InternalDynamics(nothing, "inconclusive", np.nan, np.nan, cause=FEW_SAMPLES)
     end = None if period is None else _end_of_first(positive("period", period), t0, t1)
     tangents, *resolved = _propagated(model, run, t1)
     if switch := stays_on_switch(model, run):
@@ -291,7 +291,7 @@ def quiet(run):
     """Whether a run's internal dynamics need no warning: by a bound of the growth, or by few propagators."""
     if growth_bound(run.model, run) <= UNSTABLE:
         return True
-    tangents = _tangents(run.model, run, _instants(run, run.span[1], FEW)).in_fours()
+    tangents = _tangents(run.model, run, _instants(run, run.span[1], AT_FIRST)).in_fours()
     steps, longer = (_steps(tangents[::stride]) for stride in (1, 2))
     if steps is None or longer is None:
         return False
