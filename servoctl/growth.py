@@ -41,10 +41,8 @@ TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
-AT_FIRST, TOLD = (
-    64,
-    0.3,
-)  # intervals that may tell that there is nothing to warn of; what longer ones may change ln(growth) by
+AT_FIRST = 256  # intervals that may tell that there is nothing to warn of
+TOLD = 0.3  # what intervals twice as long may change ln(growth) by, where they tell
 GLANCES = 128  # intervals by which these instants are spread over the way of the states
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
