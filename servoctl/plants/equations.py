@@ -226,7 +226,8 @@ class PlantEquations:
         matrix, right = ca.blockcat([[M, G.T], [G, ca.SX(G.shape[0], G.shape[0])]]), ca.vertcat(*right)
         terms = ca.fabs(matrix) @ ca.fabs(self._solved[0]) + ca.fabs(right)
         left = ca.fabs(matrix @ self._solved[0] - right)
-        return self.function("unsolved", [ca.mmax(left / (terms + SMALL * ca.mmax(terms) + TINY))])
+        # a sum, as the largest of values passes over what is not finite
+        return self.function("unsolved", [ca.sum1(left / (terms + SMALL * ca.mmax(terms) + TINY))])
 
     @cached_property
     def state_rates(self):
