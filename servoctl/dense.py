@@ -128,11 +128,8 @@ def between(run):
     return tuple(pieces)
 
 
-def resolved(run):
-    """Whether the polynomials between the samples of a run have the accelerations that its equations give there."""
-    if run.method in INEXACT:
-        return True
-    pieces = between(run) if run.model is not None and np.isfinite(run.jets).all() else ()
+def resolved(pieces):
+    """Whether polynomials `between` samples have the accelerations that the equations give there."""
     for piece in pieces:
         middle, h, n = (piece.t[1:] + piece.t[:-1]) / 2, np.abs(np.diff(piece.t)), piece.model.n
         curve = replace(piece.jets, exact=False)(np.arange(len(h)), middle, piece.model.p)

@@ -1,5 +1,6 @@
 """A run: what a simulation computed, by name."""
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from functools import cached_property
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from servoctl import archive
 from servoctl.checks import antiderivative, as_numbers, finite, named, require_kind, rows_read, whole
-from servoctl.dense import between, extremes, extremes_at, jets_at, piece_of, resolved
+from servoctl.dense import INEXACT, between, extremes, extremes_at, jets_at, piece_of, resolved
 from servoctl.errors import SpecificationError, unknown
 from servoctl.markup import EXTREMA, Detailed, digits, fitted, listed
 from servoctl.model.equations import residual_names, signal_groups
@@ -366,7 +367,7 @@ class Run(Sampled, Value):
         SpecificationError
             As by `at`, and for instants in another order.
         """
-        jets, times = self.at(np.atleast_1d(t)), self._within(t)
+        times = self._within(np.atleast_1d(t))
         if (np.diff(times) * (self.span[1] - self.span[0]) < 0).any():
             raise SpecificationError(
                 "Instants were given in another order than that of the run.",
@@ -376,7 +377,7 @@ class Run(Sampled, Value):
             )
         ranges = [(int(np.argmax(inside)), int(inside.sum()), model) for model, inside in self.by_model(times)]
         variants = tuple((first, first + count, model) for first, count, model in ranges) if self.variants else ()
-        return replace(self, t=times, jets=jets, variants=variants, stored={}, stored_residual={})
+        return replace(self, t=times, jets=self.at(times), variants=variants, stored={}, stored_residual={})
 
     def by_model(self, t: np.ndarray) -> list[tuple[Model, np.ndarray]]:
         """The models that hold at instants, with their choices of pivots and sides of switches.
@@ -389,12 +390,14 @@ class Run(Sampled, Value):
         Returns
         -------
         list of (Model, (N,) array of bool)
-            Each with the instants at which it holds.
+            Each with the instants at which it holds, in their order; a model that holds again comes again.
         """
         if not len(self._pieces):
             return [(self.model, np.ones(len(t), dtype=bool))]
-        which = piece_of(self._pieces, t)
-        return [(self._pieces[i].model, which == i) for i in np.unique(which)]
+        models = [piece.model for piece in self._pieces]
+        same = np.cumsum([False, *(a is not b for a, b in itertools.pairwise(models))])
+        which = same[piece_of(self._pieces, t)]
+        return [(models[np.argmax(same == i)], which == i) for i in np.unique(which)]
 
     @property
     def span(self) -> tuple[float, float]:
@@ -410,7 +413,7 @@ class Run(Sampled, Value):
     @cached_property
     def resolved(self):
         """Whether the motion is known between its samples: by its steps, or as these are dense enough."""
-        return bool(self.steps) or resolved(self)
+        return bool(self.steps) or self.method in INEXACT or resolved(self._pieces)
 
     def _within(self, t):
         """Instants (N,) of the run, without what rounding lets them exceed it."""
@@ -452,8 +455,9 @@ class Run(Sampled, Value):
         cuts = np.unique(
             np.clip(np.concatenate([*ends, self.knots, ends_of_pieces(self.model, (low, high))]), low, high)
         )
-        group = self._groups.get(name)
-        size = np.nanmax(np.abs(values if group is None else self.signals(group)[1]), initial=0.0)
+        groups = self._groups
+        kind = [other for other in groups if groups[other] == groups.get(name)] or [name]
+        size = max(np.nanmax(np.abs(self[other]), initial=0.0) for other in kind)
         return extremes(lambda t: self.sampled(t[::forward])[name][::forward], cuts, self.t, values, size)
 
     def save(self, path):

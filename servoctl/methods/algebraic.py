@@ -53,10 +53,6 @@ class _Algebraic(Stepping):
         """States (q, γ') from q and further outputs of `Equations.path`."""
         return np.concatenate([z[: self.model.nq], self._levels(z)[0]])
 
-    def _jets(self, z):
-        """Jets (q, γ', γ'') from q and further outputs of `Equations.path`."""
-        return _jets_from(self.model, z)
-
     def _pivots_of(self, outputs):
         return self._levels(outputs)[2]
 
@@ -92,7 +88,7 @@ class _Algebraic(Stepping):
         z, solved = self.f.newton(times, nodes, self.p)
         if z.shape[1] < len(times):
             return False
-        self.motion.fill(self.model, times, self._jets(z))
+        self.motion.fill(self.model, times, _jets_from(self.model, z))
         self.motion.keep(self.model, nodes[:, 0], _Solved(self.model, self.f, nodes))
         self.motion.start = np.concatenate([nodes[0, 1 : 1 + nq], self._levels(outputs[:, 0])[0]])
         self.motion.count(iterations=followed + solved, steps=len(nodes) - 1)
@@ -201,7 +197,7 @@ class _Algebraic(Stepping):
             z, iterations = self.f.newton(block, nodes, self.p)
             self.motion.count(iterations=iterations)
             solved = z.shape[1]
-            self.motion.add(self.model, block[:solved], self._jets(z))
+            self.motion.add(self.model, block[:solved], _jets_from(self.model, z))
             if solved < len(block):
                 return self._fail(block[solved], x, "Newton's method finds no solution of the program there")
             if solved:

@@ -142,15 +142,16 @@ class Events:
             self.signs, self.found = self.began[1], self.found[: self.began[2]]
         self.signs = dict.fromkeys(self.events, 0.0) if self.signs is None else dict(self.signs)
         self.began, crossed = (ends[0], dict(self.signs), len(self.found)), []
+        elapsed = self.forward * (ends - self.start)
+        edges = parted(elapsed, self.length) if len(ends) > 1 else elapsed
+        rounding = AS_ZERO * np.abs(jets_at(ends)[: model.nq]).max(initial=0.0)
         for name, event in self.events.items():
 
             def value(s, event=event):  # of the elapsed time
                 t = self.start + self.forward * s
                 return self._along(event, model, t, jets_at(t))
 
-            elapsed = self.forward * (ends - self.start)
-            floor = AS_ZERO * np.abs(jets_at(ends)[: model.nq]).max(initial=0.0) * isinstance(event.signal, str)
-            s = one_sign_apart(value, parted(elapsed, self.length), floor) if len(ends) > 1 else elapsed
+            s = one_sign_apart(value, edges, rounding * isinstance(event.signal, str))
             g = value(s)
             s, g = s[np.isfinite(g)], g[np.isfinite(g)]
             g = _with_start(g) if s[:1] == 0 else g

@@ -317,7 +317,8 @@ def leave_if_stiff(steps, method, limit, t, x):
 
     Without a method the motion says so.
     """
-    if method is None and steps.method not in ("Taylor", *EXPLICIT):
+    told = "stability" in steps.motion.note or steps.method not in ("Taylor", *EXPLICIT)
+    if method is None and told:
         return
     length, p = abs(t[-1] - t[0]) / (len(t) - 1), steps.model.p
     forward, mean = np.copysign(steps.watch.span, t[-1] - t[0]), np.array([length])
@@ -325,8 +326,7 @@ def leave_if_stiff(steps, method, limit, t, x):
         why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
         if method is not None:
             raise Unsuited(why, method)
-        if "stability" not in steps.motion.note:
-            steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
+        steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
 
 
 def stiff(model, t, x, p, steps, span, limit):

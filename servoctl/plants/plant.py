@@ -387,7 +387,7 @@ class Plant(Value, Shown):
             k = int(np.argmax(weak))
             other = self.near(t[k], x[:, k])
             sound = weak & other._sound(t, x, p)
-            sound[k] = True  # no other pivots are better there
+            sound = sound if sound[k] else weak  # no pivots are strong there, and others are not asked for
             y[:, sound], weak = other.function("jacobian").grid(t[sound], x[:, sound], p[:, sound]), weak & ~sound
         both = y.reshape(-1, self.n_x, len(t)).transpose(2, 1, 0)
         return both[:, :, : self.n_x], both[:, :, self.n_x :]

@@ -11,7 +11,7 @@ from servoctl.checks import as_list, as_numbers, as_span, by_name, mapping, mean
 from servoctl.errors import ServoError, SpecificationError
 from servoctl.methods.accuracy import ATOL, LARGE, coarse, unlike
 from servoctl.methods.choice import Algebraic, Automatic, Method, Taylor, as_method
-from servoctl.methods.lanes import fits, integrate, plan_many, plans_fit
+from servoctl.methods.lanes import OF_A_CASE, fits, integrate, plan_many, plans_fit
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for, stiff
 from servoctl.model.following import breaks_within, moved_by, places_of
@@ -267,7 +267,7 @@ class _Many:
         good = (ends[:, 0] > 0) & (ends[:, 3] <= OFF)
         if getattr(method, "for_stiff", None) is not None:
             steps, at = abs(span[1] - span[0]) / np.maximum(ends[:, 1], 1), np.full(len(which), float(span[1]))
-            last_states = np.ascontiguousarray(ends[:, 4 : 4 + x0.shape[1]].T)
+            last_states = np.ascontiguousarray(ends[:, len(OF_A_CASE) :][:, : x0.shape[1]].T)
             good &= ~stiff(self.model, at, last_states, p.T, steps, span[1] - span[0], order / np.e)
         good &= self._tolerances_fit(span, (x0, p), np.ascontiguousarray(ends[:, -x0.shape[1] :].T), method)
         self._take(which[good], ends[good], samples[good])

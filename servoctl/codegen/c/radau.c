@@ -277,9 +277,3 @@ int64_t FN(radau)(double t0, const double *x0, double t1, const double *p, int64
     counts[3] = m.nlu;
     return k;
 }
-
-/* Restores the invariants at n instants; x is (n, n_x). */
-void FN(settle)(int64_t n, const double *t, double *x, const double *p)
-{
-    for (int64_t k = 0; k < n; k++) restore(t[k], x + k * NX, p);
-}
