@@ -9,8 +9,16 @@ from scipy.linalg import qr
 
 from servoctl.errors import SingularProgram
 from servoctl.reduction import ranks
-from servoctl.reduction.ranks import clean, combination, decide, decide_all, eliminate, equilibrate, pivot_order
-from servoctl.reduction.realisation import _independent_columns
+from servoctl.reduction.ranks import (
+    _independent_columns,
+    clean,
+    combination,
+    decide,
+    decide_all,
+    eliminate,
+    equilibrate,
+    pivot_order,
+)
 from servoctl.tolerances import EXTENDED, NOISE
 
 LONG = np.longdouble

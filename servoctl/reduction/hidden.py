@@ -19,6 +19,7 @@ from servoctl.reduction.rows import (
     merge_uses,
     settle,
     slopes,
+    solved_columns,
     values_and_sizes,
     vanishing_gradient,
 )
@@ -123,7 +124,7 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     top = rows[b].order
     _require_affine(rows, support, top)
     others = [a for a in support if a != b]
-    parts, pivots = _combine(q, rows, b, others, top, numbers)
+    parts, pivots = _combine(q, rows, b, others, top, numbers, context)
     derivation = in_words(rows[b], [rows[a] for a in others], top)
     uses = combined_uses([rows[a] for a in support])
     vanishing = sum((rows[a].vanishing for a in support), ())
@@ -196,14 +197,14 @@ def _beside_manifold(q, rows, b, context):
         yield [order[i] for i in support], numbers
 
 
-def _combine(q, rows, b, others, top, numbers):
+def _combine(q, rows, b, others, top, numbers, context):
     """The terms of χ = ψ_b + Σ w_a D^(top - o_a) ψ_a with the w that cancels the leading gradient of row b."""
     if not others:
         return [rows[b].expression], []
     rank = decide(numbers[others, :, 0])
     if rank.rank < len(others):  # rows that depend on each other at some points only
         raise _ill_conditioned([rows[a] for a in others], rank)
-    columns = sorted(rank.columns)
+    columns = solved_columns(q, numbers[others, :, 0], rank, context)
     matrix = ca.vertcat(*(rows[a].gradient(q) for a in others))[:, columns].T
     target = -rows[b].gradient(q)[:, columns].T
     w, pivots = eliminate(matrix, target, numbers[others][:, columns].swapaxes(0, 1))

@@ -154,6 +154,32 @@ def generic(ranks):
     return Rank(top, kept, dropped, chosen.rows, chosen.columns), best
 
 
+def sizeable_columns(matrix, columns, inertia):
+    """Independent columns of a matrix (b, n) at a point: the given ones, or others in the metric of the inertia (n,).
+
+    Equilibration makes a column that is about to vanish as large as any other; with the inertia of its coordinate it is
+    small.
+    """
+    if not len(columns) or not (inertia > 0).all():
+        return columns
+    scaled = (matrix / np.sqrt(inertia)).astype(float)
+    scaled /= np.linalg.norm(scaled, axis=1, keepdims=True)
+    others = _independent_columns(scaled, len(columns))
+    given, best = (np.linalg.svd(scaled[:, some], compute_uv=False)[-1] for some in (columns, others))
+    return columns if given >= THRESHOLD * best else others
+
+
+def _independent_columns(matrix, count):
+    """So many columns of a matrix (m, n): each the longest beside those before it (QR with column pivoting)."""
+    rest, chosen = matrix.copy(), []
+    for _ in range(count):
+        lengths = np.linalg.norm(rest, axis=0)
+        chosen.append(int(np.argmax(lengths)))
+        direction = rest[:, chosen[-1]] / lengths[chosen[-1]]
+        rest -= np.outer(direction, direction @ rest)
+    return chosen
+
+
 def combination(rows, target):
     """Coefficients c (m,) with c @ rows = target, of rows (m, n), and the residual relative to the target."""
     scaled, row_factors, _ = equilibrate(np.vstack([rows, target[None, :]]))

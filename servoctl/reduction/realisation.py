@@ -16,7 +16,7 @@ import numpy as np
 from servoctl.errors import NotRealisable, SingularProgram, SpecificationError
 from servoctl.reduction.appell import Realisation, plant_solution
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.ranks import THRESHOLD, clean, decide_all, decide_each
+from servoctl.reduction.ranks import clean, decide_all, decide_each, sizeable_columns
 from servoctl.reduction.rows import balances, settle_rows
 from servoctl.spec.coordinates import require_order
 from servoctl.spec.mechanism import inverse_directions
@@ -79,37 +79,11 @@ def _realised(mechanism, constraints, directions, actuation, points, among=None,
         )
     cleaned = clean(numbers, sizes)
     inertia = clean(*points.matrix(ca.diag(mechanism.mass)))[candidates, 0, best]
-    columns = _sizeable_columns(cleaned[:, candidates, best], inertia, list(rank.columns))
+    columns = sizeable_columns(cleaned[:, candidates, best], list(rank.columns), inertia)
     dependent = tuple(sorted(candidates[i] for i in columns))
     regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
     independent = tuple(i for i in range(n) if i not in dependent)
     return Realisation(B, actuation, dependent, independent, cleaned[:, :, regular or [best]], **settled)
-
-
-def _sizeable_columns(matrix, inertia, columns):
-    """Independent columns of a matrix (b, n) at a point: the given ones, or others in the metric of the inertia (n,).
-
-    Equilibration makes a column that is about to vanish as large as any other; with the inertia of its coordinate it is
-    small.
-    """
-    if not len(columns) or not (inertia > 0).all():
-        return columns
-    scaled = (matrix / np.sqrt(inertia)).astype(float)
-    scaled /= np.linalg.norm(scaled, axis=1, keepdims=True)
-    others = _independent_columns(scaled, len(columns))
-    given, best = (np.linalg.svd(scaled[:, some], compute_uv=False)[-1] for some in (columns, others))
-    return columns if given >= THRESHOLD * best else others
-
-
-def _independent_columns(matrix, count):
-    """So many columns of a matrix (m, n): each the longest beside those before it (QR with column pivoting)."""
-    rest, chosen = matrix.copy(), []
-    for _ in range(count):
-        lengths = np.linalg.norm(rest, axis=0)
-        chosen.append(int(np.argmax(lengths)))
-        direction = rest[:, chosen[-1]] / lengths[chosen[-1]]
-        rest -= np.outer(direction, direction @ rest)
-    return chosen
 
 
 def _shared(mechanism, program, constraints, independent, points, context):

@@ -11,7 +11,7 @@ from servoctl.jets.branches import shown
 from servoctl.jets.identity import identical_zeros
 from servoctl.jets.series import Flow
 from servoctl.reduction.manifold import POINTS_SEED, ROUNDED, anywhere, sample, solve
-from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined
+from servoctl.reduction.ranks import clean, combination, decide, eliminate, equilibrate, refined, sizeable_columns
 from servoctl.tolerances import DEPENDENT, ENTRY
 from servoctl.values import frozen
 
@@ -283,7 +283,7 @@ def settle(q, row, others, context, starts=None):
         values = slopes(q, row, j, points)
         if np.any(values):
             lower = [other for other in others if other.order < j or (other.order == j and other.affine and j > 0)]
-            eliminated = _eliminated(q, row, j, values, lower, points)
+            eliminated = _eliminated(q, row, j, values, lower, points, context)
             if eliminated is None:
                 return _of_order(q, row, j, points), points
             row = eliminated
@@ -348,7 +348,7 @@ def _of_order(q, row, j, points):
     return resting
 
 
-def _eliminated(q, row, j, values, lower, points):
+def _eliminated(q, row, j, values, lower, points, context):
     """The row with jets γ^(j) replaced by the solution of lower rows, or None where these do not determine it."""
     if not lower:
         return None
@@ -367,7 +367,7 @@ def _eliminated(q, row, j, values, lower, points):
     rows, numbers = [lower[a] for a in basis], numbers[basis]
     if not rows or any(other.order == j and not other.affine for other in rows):
         return None
-    columns = sorted(decide(numbers[:, :, 0]).columns)
+    columns = solved_columns(q, numbers[:, :, 0], decide(numbers[:, :, 0]), context)
     jets = q.jet(j)[columns]
     raised = ca.vertcat(*(q.derivatives([other.expression], j - other.order)[-1][0] for other in rows))
     rest = ca.substitute(raised, jets, ca.SX.zeros(len(columns)))
@@ -376,6 +376,15 @@ def _eliminated(q, row, j, values, lower, points):
     uses = merge_uses((row.uses, 0), *((other.uses, j - other.order) for other in rows))
     expression, *parts = _substituted(row, ca.vertsplit(jets), solution)
     return replace(row, expression=ca.cse(expression), uses=uses, parts=tuple(parts))
+
+
+def solved_columns(q, matrix, rank, context):
+    """The columns in which independent rows (k, n) of a rank are solved: by the inertia, where it is known."""
+    columns = list(rank.columns)
+    if context.saddle is not None:
+        inertia = clean(*anywhere(q, 2, context).matrix(ca.diag(context.saddle)[: q.n]))[:, 0].mean(axis=1)
+        columns = sizeable_columns(matrix, columns, inertia)
+    return sorted(columns)
 
 
 def dependence(numbers, first=0):
