@@ -35,8 +35,7 @@ static inline double length(const double *x, const double *c, const double *w, i
     return shortest;
 }
 
-/* The step h at which the last terms of all rates meet the tolerance, with weights w (NX) of the state or NULL. Places count
-   by their rates q', and so relative to the way of a step: their own sizes hang on the origin. */
+/* The step h at which the last terms of all rates, q' too, as q has no origin, meet the tolerance; w (NX) may be NULL. */
 static inline double step_length(const double *x, const double *y, const double *w, double log_rtol, double least)
 {
     const double *c = y + (PLAIN ? 0 : NQ * LAST);
