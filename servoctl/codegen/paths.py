@@ -59,8 +59,10 @@ class Followed:
     def _evaluated(self, t, order, instants):
         """As `jets`."""
         if self._library is None:
-            rows = [_jets_of(path, t, order, instants) for path in self.paths]
-            return np.stack(rows, axis=1).reshape(-1, len(t))
+            jets, known = np.full((order + 1, len(self.paths), len(t)), np.nan), np.isfinite(t) & np.isfinite(instants)
+            for i, path in enumerate(self.paths):
+                jets[:, i, known] = path.jets(t[known], order, instants[known])[:, 0]
+            return jets.reshape(-1, len(t))
         jets = np.empty((len(t), (order + 1) * len(self.paths)))
         given = [np.ascontiguousarray(part, dtype=float) for part in (instants, t)]
         sizes = map(ctypes.c_int64, (len(self.paths), order, len(t)))
@@ -77,16 +79,6 @@ class Followed:
 def _library(command):
     """The library of paths.c by the compiler that a command calls; None without one."""
     return compiler.library(IN_C, "-O2", exact=True, calls=0) if command else None
-
-
-def _jets_of(path, t, order, instants):
-    """Derivatives (order + 1, N) of a path, NaN where times (N,) or instants (N,) are not finite."""
-    known = np.isfinite(t) & np.isfinite(instants)
-    if known.all():
-        return path.jets(t, order, instants)[:, 0]
-    jets = np.full((order + 1, len(t)), np.nan)
-    jets[:, known] = path.jets(t[known], order, instants[known])[:, 0]
-    return jets
 
 
 def followed(address):
