@@ -290,9 +290,10 @@ def quiet(run):
     if growth_bound(run.model, run) <= UNSTABLE:
         return True
     tangents = _tangents(run.model, run, _instants(run, run.span[1], AT_FIRST)).in_fours()
-    size, corners, steps = _frobenius(tangents.frozen), tangents[::2], _steps(tangents)
+    size, corners = _frobenius(tangents.frozen), tangents[::2]
     short = np.abs(np.diff(tangents.t)) * np.maximum(size[1:], size[:-1]) <= SHORT
-    if steps is None or not short.all():
+    steps = _steps(tangents) if short.all() else None
+    if steps is None:
         return False
     return not _unstable(corners, steps, *_growth(corners, _propagators(steps, _block_ends(corners.t))))
 

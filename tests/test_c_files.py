@@ -16,7 +16,7 @@ FILES = [(folder, file.name) for folder in (LOOPS, EXPORTED) for file in folder.
 
 def test_every_loop_has_a_file():
     others = {"allocation.c", "batch.c", "builtin.c", "exponentials.c", "grid.c", "machine.c", "many.c", "normal.c",
-              "plans.c", "riccati.c"}
+              "paths.c", "plans.c", "riccati.c"}
     assert {f"{loop}.c" for loop in loops.LOOPS} | others == {n for folder, n in FILES if folder is LOOPS}
     assert all(loops.source(f"{loop}.c").startswith(("/*", "#include")) for loop in loops.LOOPS)
     exported = {"answer.c", "newton.c", "integrated.c", "advance.c", "law.c", "limited.c", "table.c", "thinned.c"}

@@ -14,7 +14,7 @@ from scenes import CERTIFIED
 from scipy.integrate import solve_ivp
 
 import servoctl as sv
-from servoctl import simulation
+from servoctl import growth, simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
 from servoctl.growth import growth_bound
 
@@ -473,3 +473,10 @@ def test_blocks_of_unequal_times_do_not_make_growth_exponential(length, samples,
     assert found.growth == pytest.approx({9.0: 33.5, 20.0: 80.0}[length], rel=0.05)
     if samples > 41 or length > 9.0:  # 41 samples give 3.01, within the two percent of growth by longer steps
         assert found.verdict == "neutral"
+
+
+def test_few_intervals_that_are_long_for_the_linearisation_have_no_propagators(gallery_model, monkeypatch):
+    model, scene = gallery_model("elastic-link"), gallery["elastic-link"]
+    run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span, "RadauIIA")
+    monkeypatch.setattr(growth, "_steps", None)
+    assert not growth.quiet(run)

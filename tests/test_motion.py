@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import DenseOutput
 
 import servoctl as sv
+from servoctl.gallery import gallery
 from servoctl.methods.motion import Motion
 from servoctl.methods.watch import Residuals
 from servoctl.model.variants import place_of, variant_at
@@ -91,3 +93,17 @@ def test_motions_from_one_start_derive_their_variants_once(monkeypatch):
     for k in range(MOST_VARIANTS):
         variant_at(model, (1e-3 * (k + 1), *place[1:]))
     assert variant_at(model, place) is not runs[0].variants[-1][2] and variant_at(model, place) == runs[0].variants[-1][2]
+
+
+@pytest.mark.parametrize("method", ["RK45", "DOP853", "LSODA"])  # Radau's own steps begin by it, too
+def test_the_dense_output_of_a_step_is_evaluated_once(method, gallery_model, monkeypatch):
+    model, scene, counted = gallery_model("acrobot"), gallery["acrobot"], []
+    start, evaluated = model.start(**scene.start, guess=scene.guess), DenseOutput.__call__
+    monkeypatch.setattr(DenseOutput, "__call__", lambda self, t: counted.append(t) or evaluated(self, t))
+    run = sv.simulate(model, start, (0.0, 2.0), method)
+    assert len(counted) >= run.counters["steps"] > 0
+    assert len(counted) <= run.counters["steps"] + 16  # of steps that were taken again
+    times = np.linspace(0.0, 2.0, 77)
+    before = len(counted)
+    run.at(times)
+    assert len(counted) == before

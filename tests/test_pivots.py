@@ -10,11 +10,12 @@ from conftest import relative
 import servoctl as sv
 from servoctl.codegen import compiler
 from servoctl.gallery import gallery
+from servoctl.jets.tape import Plan
 from servoctl.methods.monitor import Monitor
 from servoctl.methods.taylor import series_loop
 from servoctl.model import model as models
 from servoctl.model import store
-from servoctl.model.pivots import pivot_strength
+from servoctl.model.pivots import pivot_strength, pivots_at
 from servoctl.model.variants import derived_near, place_of, with_diagonal_pivots
 
 
@@ -308,3 +309,12 @@ def test_a_variant_that_does_not_serve_other_parameters_is_derived_with_these(sl
     assert near is derived_near(other, 0.0, -jets)  # the sign of a zero is no other place
     rates = near.function("ode")(0.0, jets[: len(model.state_names)], near.p)
     assert rates[2:4] == pytest.approx(9.81 / (1 + slope**2) * np.array([slope, -1.0]), rel=1e-12)
+
+
+def test_pivots_at_a_state_ask_for_no_sizes(gallery_model, monkeypatch):
+    model, scene = gallery_model("steady-satellite"), gallery["steady-satellite"]
+    start = model.start(**scene.start, guess=scene.guess)
+    y = model.function("ode")(start.t, start.values, model.p)
+    monkeypatch.setattr(Plan, "sizes", None)
+    jets = np.append(start.values, y[len(start.values) - model.n : len(start.values)])
+    np.testing.assert_allclose(pivots_at(model, start.t, jets), y[len(start.values) :], rtol=1e-9)

@@ -297,6 +297,35 @@ def test_compiled_jets_vanish_where_those_of_the_path_do(n, sides):
         assert f.backend == "c" and (zeros > 4 or "hold" not in sides)
 
 
+@pytest.mark.parametrize("sides", [("hold", "hold"), ("continue", "hold"), ("hold", "continue"), ("periodic",) * 2])
+def test_jets_by_the_library_have_the_bits_of_those_by_numpy(sides, monkeypatch):
+    for path in joined(*sides):
+        t = np.concatenate([np.linspace(-2.0, 9.0, 301), path.breaks, [np.nan, np.inf, -np.inf]])
+        other = np.roll(t, 1)
+        paths, alone = Followed([path[0], path[-1]]), Followed([path[0], path[-1]])
+        monkeypatch.setitem(vars(alone), "_library", None)
+        for order in (0, 1, 7, 40):
+            for instants in (None, other):
+                found, expected = (some.jets(t, order, instants) for some in (paths, alone))
+                assert np.array_equal(found, expected, equal_nan=True)
+                known = np.isfinite(t) & np.isfinite(t if instants is None else instants)
+                assert np.array_equal(np.isnan(found).all(axis=0), ~known) and found.shape == (2 * (order + 1), len(t))
+
+
+@pytest.mark.skipif(compiler.compiler() is None, reason="needs a compiler")
+def test_rates_take_no_jets_from_numpy_one_by_one(monkeypatch):
+    model = cart_pole(lambda q: q.references(X=PATH[0]).X)
+    start, counted, taylor = model.start(theta=0.01), [], sv.paths.Path._taylor
+    monkeypatch.setattr(sv.paths.Path, "_taylor", lambda *given: counted.append(given) or taylor(*given))
+    found = []
+    for length in (0.2, 2.0):
+        run = sv.simulate(model, start, (0.0, length), "DOP853")
+        found.append((run.counters["nfev"], len(counted)))
+        counted.clear()
+    (few, first), (many, second) = found
+    assert many > 2 * few and second <= first + 2 and second < 20  # not one by one
+
+
 def test_equal_mechanisms_that_travelled_keep_references_of_their_own():
     """An equal mechanism without references, or along other paths, came first: the copy is not taken for it."""
     bare, _ = crane()

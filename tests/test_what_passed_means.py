@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import servoctl as sv
+from servoctl.gallery import gallery
 
 G = 9.81
 
@@ -86,6 +87,17 @@ def test_of_a_crane_with_a_damped_rope(moving, held, guess):
     assert all(f"{name} = {value:.4g} was held" in said for name, value in held.items())
     again, more = warned(model, found(model, said), (0.0, 8.0))
     assert more == [] and np.abs(again["trolley"]).max() < 0.01 * np.abs(run["trolley"][0])
+
+
+def test_the_start_without_a_transient_is_sought_once(gallery_model, monkeypatch):
+    """A rest, and where a motion has come to that began earlier: each by two starts, and no call where forces stay."""
+    model, scene = gallery_model("tumbling-satellite"), gallery["tumbling-satellite"]
+    model = model.with_parameters()
+    start, counted, made = model.start(**scene.start, guess=scene.guess), [], type(model).start
+    monkeypatch.setattr(type(model), "start", lambda *given, **held: counted.append(held) or made(*given, **held))
+    for expected in (4, 0):
+        assert warned(model, start, scene.t_span)[1] == [] and len(counted) == expected
+        counted.clear()
 
 
 def decaying(q):

@@ -2,18 +2,24 @@
 
 A function f(t, x, p, r) contains jets of references r, an input (n, K + 1) with the derivatives 0 .. K of n references.
 Who calls it gives t, x and p alone: the first number of p is the address of the `Followed` paths, from which its C code
-takes the jets at each instant that it evaluates; CasADi receives those that NumPy takes from the paths.
+takes the jets at each instant that it evaluates; CasADi receives them by one small library for all functions, or from
+NumPy where there is no compiler. Both have the same bits.
 """
 
+import ctypes
+import os
 import weakref
+from functools import cache, cached_property
 
 import casadi as ca
 import numpy as np
 
+from servoctl.codegen import compiler
 from servoctl.errors import SpecificationError
 
 BY_INSTANT = "of_piece"  # name of the fourth input of a function whose last parameter selects the pieces of paths
 RULES = {"hold": 0, "continue": 1, "periodic": 2}  # as in path.h
+IN_C = '#define NAME servoctl\n#include "paths.c"\n'
 
 _alive = weakref.WeakValueDictionary()  # by address
 
@@ -42,24 +48,39 @@ class Followed:
 
         They are NaN where a time is none: steps that fail ask for such, and are told by what they get.
         """
-        key = tuple(np.ravel([t, t if instant is None else instant]).tolist()) if len(t) == 1 else None
+        instant = t if instant is None else instant
+        key = (t[0], instant[0]) if len(t) == 1 else None
         last, jets = self._last
         size = (order + 1) * len(self.paths)
         if key is None or key != last or len(jets) < size:  # functions ask for one instant again and again
-            rows = [_jets_of(path, t, order, t if instant is None else instant) for path in self.paths]
-            jets = np.stack(rows, axis=1).reshape(-1, len(t))
+            jets = self._evaluated(t, order, instant)
             self._last = (key, jets) if key else self._last
         return jets[:size]
 
+    def _evaluated(self, t, order, instants):
+        """As `jets`."""
+        if self._library is None:
+            jets, known = np.full((order + 1, len(self.paths), len(t)), np.nan), np.isfinite(t) & np.isfinite(instants)
+            for i, path in enumerate(self.paths):
+                jets[:, i, known] = path.jets(t[known], order, instants[known])[:, 0]
+            return jets.reshape(-1, len(t))
+        jets = np.zeros((len(t), (order + 1) * len(self.paths)))
+        arrays = *(np.ascontiguousarray(part, dtype=float) for part in (instants, t)), jets
+        sizes = map(ctypes.c_int64, (len(self.paths), order, len(t)))
+        self._library.servoctl_paths(
+            ctypes.c_double(self.address), *sizes, *(ctypes.c_void_p(a.ctypes.data) for a in arrays)
+        )
+        return jets.T
 
-def _jets_of(path, t, order, instants):
-    """Derivatives (order + 1, N) of a path, NaN where times (N,) or instants (N,) are not finite."""
-    known = np.isfinite(t) & np.isfinite(instants)
-    if known.all():
-        return path.jets(t, order, instants)[:, 0]
-    jets = np.full((order + 1, len(t)), np.nan)
-    jets[:, known] = path.jets(t[known], order, instants[known])[:, 0]
-    return jets
+    @cached_property
+    def _library(self):
+        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _library(compiler.compiler())
+
+
+@cache
+def _library(command):
+    """The library of paths.c by the compiler that a command calls; None without one."""
+    return compiler.library(IN_C, "-O2", exact=True, calls=0) if command else None
 
 
 def followed(address):

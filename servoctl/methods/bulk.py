@@ -17,7 +17,6 @@ REPEATS = 8  # of a step at one instant, after which it is believed
 SHORTER = 1e-2  # to which part a first step is shortened that errs by far
 FUTILE = 1e-8  # of the span: a shorter step that misses the equations where the rank is lost ends the motion
 SHORTEST = 1e-12  # of the span: shorter steps are not repeated, so that a jump of the equations is passed
-SPACING = 1e-3  # of a step, between the points by which its dense output is differentiated
 
 
 @frozen
@@ -185,12 +184,3 @@ class _Stepped:
     def __call__(self, k, t, p):
         """Jets (n_z, N) at instants t (N,) within steps k (N,)."""
         return self.with_top(t, self.states(k, t, p), p)
-
-
-def differentiated(dense, t, k, times):
-    """Derivatives of dense output (k, times) -> (n_x, N) by central differences within steps of ends t (S + 1,)."""
-    h, n = np.diff(t)[k], len(times)
-    offsets = np.array([-2, -1, 1, 2])
-    around = (times + (SPACING * offsets)[:, None] * h).ravel()
-    two, one, next_one, next_two = np.split(dense(np.tile(k, len(offsets)), around), np.arange(1, 4) * n, axis=1)
-    return (8 * (next_one - one) - (next_two - two)) / (12 * SPACING * h)

@@ -34,12 +34,7 @@ def radau(order):
 
     s = STAGES[order]
     c = np.append((1.0 + roots_jacobi(s - 1, 1.0, 0.0)[0]) / 2.0, 1.0)
-    nodes = np.append(0.0, c)
-    gaps = nodes[:, None] - nodes + np.eye(s + 1)
-    weights = 1.0 / gaps.prod(axis=1)
-    derivative = weights / weights[:, None] / gaps
-    derivative[np.diag_indices(s + 1)] = (1.0 / gaps).sum(axis=1) - 1.0
-    rate = derivative[1:, 1:]
+    rate = rates_at(c)
     values, vectors = np.linalg.eig(rate)
     real = np.argmin(np.abs(values.imag))
     pairs = [i for i in np.argsort(values.imag) if values[i].imag > 1e-6]
@@ -51,6 +46,16 @@ def radau(order):
     powers = np.vander(c, s, increasing=True).T
     e = mu[0, 0] * np.linalg.solve(powers, np.append(-1.0 / mu[0, 0], np.zeros(s - 1))) @ rate
     return c, rate, from_pairs, np.linalg.inv(from_pairs), mu, e
+
+
+def rates_at(c):
+    """What maps values (s,) at nodes c, of a polynomial that is 0 at 0, to its derivatives there, (s, s)."""
+    nodes = np.append(0.0, c)
+    gaps = nodes[:, None] - nodes + np.eye(len(nodes))
+    weights = 1.0 / gaps.prod(axis=1)
+    derivative = weights / weights[:, None] / gaps
+    derivative[np.diag_indices(len(nodes))] = (1.0 / gaps).sum(axis=1) - 1.0
+    return derivative[1:, 1:]
 
 
 def basis(c, theta):
@@ -156,10 +161,10 @@ def _size(v):
 
 @frozen
 class Collocated(Steps):
-    """Steps of a Radau IIA method."""
+    """Steps along which states are polynomials, with values at nodes of each."""
 
-    order: int
-    z: np.ndarray  # (S, s, n_x) increments of the stages
+    nodes: tuple  # c (s,), parts of the step, and their `rates_at`
+    z: np.ndarray  # (S, s, n_x) increments from the start of the step to these nodes
 
     @property
     def nbytes(self):
@@ -167,15 +172,15 @@ class Collocated(Steps):
         return self.x.nbytes + self.z.nbytes
 
     def at(self, k, times):
-        """States (n_x, N) at times (N,) within steps k (N,), by the collocation polynomials."""
+        """States (n_x, N) at times (N,) within steps k (N,), by these polynomials."""
         theta, _ = self._parts(k, times)
-        weights = basis(radau(self.order)[0], theta)
+        weights = basis(self.nodes[0], theta)
         return self.x[:, k] + np.einsum("jm,mjl->lm", weights, self.z[k])
 
     def slope(self, k, times):
-        """Their derivatives: polynomials through the rates of the stages."""
+        """Their derivatives: polynomials through the rates at the nodes."""
         theta, h = self._parts(k, times)
-        c, rate = radau(self.order)[:2]
+        c, rate = self.nodes
         return np.einsum("jm,mjl->lm", rate.T @ lagrange(c, theta), self.z[k]) / h
 
     def _parts(self, k, times):
@@ -251,4 +256,4 @@ class RadauSteps(BulkSteps):
             self.motion.count(projections=len(z) // self.every)
             if t[-1] == b:
                 x = np.column_stack([x[:, :-1], self.projection.restore_grid(t[-1:], x[:, -1:], self.p)])
-        return Collocated(t, x, len(z) < self.most and t[-1] != b, self.settings.order, z)
+        return Collocated(t, x, len(z) < self.most and t[-1] != b, radau(self.settings.order)[:2], z)

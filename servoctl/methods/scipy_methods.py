@@ -1,40 +1,26 @@
 """scipy's adaptive methods on compiled right-hand sides, with projection after their steps."""
 
+import functools
+
 import numpy as np
 
-from servoctl.methods.bulk import BulkSteps, Steps, differentiated
+from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.choice import Project
+from servoctl.methods.radau import Collocated, rates_at
 from servoctl.methods.taylor import leave_if_stiff
 from servoctl.methods.watch import edge
-from servoctl.values import frozen
 
-OBJECTS = 700  # bytes that scipy's dense output of a step takes beside its coefficients
+DEGREES = {"RK45": 4, "DOP853": 7, "Radau": 3, "LSODA": 12}  # of the polynomials of dense output
 AT_ONCE = 16  # steps that are inspected together, at most: twice as many each time
 MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
 
 
-@frozen
-class Solved(Steps):
-    """Steps of a solver."""
-
-    dense: list  # for each step: states (n_x, N) from times (N,) within it
-
-    @property
-    def nbytes(self):
-        """Memory of the steps: coefficients of polynomials of a degree up to 8, and objects about them."""
-        return 8 * self.x.nbytes + OBJECTS * len(self.dense)
-
-    def at(self, k, times):
-        """States (n_x, N) at times (N,) within steps k (N,)."""
-        states = np.empty((len(self.x), len(times)))
-        for step in np.unique(k):
-            here = k == step
-            states[:, here] = self.dense[step](times[here])
-        return states
-
-    def slope(self, k, times):
-        """Their derivatives."""
-        return differentiated(self.at, self.t, k, times)
+@functools.cache
+def nodes_of(method):
+    """Chebyshev's nodes but 0 of the polynomials within a step from 0 to 1, and their `rates_at`."""
+    degree = DEGREES[method]
+    c = (1 - np.cos(np.pi * np.arange(1, degree + 1) / degree)) / 2
+    return c, rates_at(c)
 
 
 class ScipySteps(BulkSteps):
@@ -85,24 +71,27 @@ class ScipySteps(BulkSteps):
 
     def _steps(self, t, x, b):
         solver, self.failure = self._continued(t, x, b), ""
-        t, x, dense = [t], [solver.y.copy()], []
-        while solver.status == "running" and len(dense) < self.most:
+        t, x, z, nodes = [t], [solver.y.copy()], [], nodes_of(self.method)
+        while solver.status == "running" and len(z) < self.most:
             message = _step(solver)
             if solver.status == "failed" or not np.all(np.isfinite(solver.y)):
                 self.failure = (message or "the state is no longer finite").rstrip(".")
                 break
-            dense.append(solver.dense_output())
-            if self.projects and ((self.taken + len(dense)) % self.drift.every == 0 or solver.status == "finished"):
+            inside = solver.t_old + nodes[0] * (solver.t - solver.t_old)
+            z.append(solver.dense_output()(inside).T - x[-1])
+            if self.projects and ((self.taken + len(z)) % self.drift.every == 0 or solver.status == "finished"):
                 self._project()
             t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
-        if len(dense) == AT_ONCE:
+        if len(z) == AT_ONCE:
             leave_if_stiff(self, self.for_stiff, 1.0, np.array(t), x[-1])  # a mode that decays within each step
         self.most = min(2 * self.most, AT_ONCE)
-        self._count(len(dense))
-        if not self.failure and self._creeps(len(dense)):
+        self._count(len(z))
+        if not self.failure and self._creeps(len(z)):
             self.failure = "its steps shrink"
-        return Solved(np.array(t), np.array(x).T, bool(self.failure), dense)
+        return Collocated(
+            np.array(t), np.array(x).T, bool(self.failure), nodes, np.reshape(z, (-1, len(nodes[0]), len(x[0])))
+        )
 
     def _creeps(self, steps):
         """Whether the motion has stopped because it creeps towards the edge of a residual's domain."""

@@ -57,34 +57,50 @@ def _nearer(run, state, k):
 def _attracted(run, fallen, motion):
     """Starts beside that of a run: a rest, and where motions that began earlier have come to by then.
 
-    They begin as long before as the run lasts, or as the transient does until it has `fallen` [s].
+    They begin as long before as the run lasts, or as the transient does until it has `fallen` [s]. The model remembers
+    those that it found for the last start.
     """
     model, t0 = run.model, float(run.t[0])
-    known = dict(zip(model.state_names, run.jets[:, 0].tolist(), strict=False))
-    for length in (0.0, run.t[-1] - t0, fallen - t0):
-        guess = {name: value for name, value in known.items() if length or name in model.reduction.mechanism.q.names}
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                state = model.start(t0 - length, guess=guess)
-                x = motion(state, (state.t, t0)).jets[: len(known), -1] if length else state.values
-                yield model.start(t0, guess=dict(zip(known, without_rounding(x).tolist(), strict=True)))
-        except ServoError:
-            continue
+    start = dict(zip(model.state_names, run.jets[:, 0].tolist(), strict=False))
+    last, found = vars(model).get("_attracted", (None, {}))
+    if last != (t0, start):
+        last, found = vars(model)["_attracted"] = (t0, start), {}
+    for length in dict.fromkeys((0.0, float(run.t[-1]) - t0, float(fallen) - t0)):
+        if length not in found:
+            found[length] = _come_to(model, t0, start, length, motion)
+        if found[length] is not None:
+            yield found[length]
+
+
+def _come_to(model, t0, start, length, motion):
+    """The start at t0 [s] to which a motion has come that began from a start by name so long before; None if none."""
+    guess = {name: value for name, value in start.items() if length or name in model.reduction.mechanism.q.names}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            state = model.start(t0 - length, guess=guess)
+            x = motion(state, (state.t, t0)).jets[: len(start), -1] if length else state.values
+            return model.start(t0, guess=dict(zip(start, without_rounding(x).tolist(), strict=True)))
+    except ServoError:
+        return None
 
 
 def _call(state, model, later):
     """The call of a start by as few digits of its free values as serve; "" if a force is above its `later` peaks."""
-    for most in (4, 8, 16):
+    f = model.signals("actuation")[1]
+
+    def below(x):
+        forces = f.grid([state.t], with_highest(model, [state.t], x[:, None])[: f.n_x], model.p)[:, 0]
+        return (np.abs(forces) <= later).all()
+
+    for most in (4, 8, 16) if below(state.values) else ():
         held = {name: float(f"{state[name]:.{most}g}") for name in state.free}
         guess = {name: float(f"{state[name]:.4g}") for name in model.reduction.mechanism.q.names if name not in held}
         try:
-            x = model.start(state.t, guess=guess, **held).values[:, None]
+            x = model.start(state.t, guess=guess, **held).values
         except ServoError:
             continue
-        f = model.signals("actuation")[1]
-        forces = f.grid([state.t], with_highest(model, [state.t], x)[: f.n_x], model.p)[:, 0]
-        if (np.abs(forces) <= later).all():
+        if below(x):
             values = [f"t={state.t:g}"] * bool(state.t) + [f"{name}={value}" for name, value in held.items()]
             return f"model.start({', '.join([*values, *[f'guess={guess}'] * bool(guess)])})"
     return ""

@@ -8,7 +8,7 @@ from servoctl.model.following import instants_of
 def pivots_at(model, t, jets):
     """Pivots (n_g,) at an instant t [s] with jets (n_z,)."""
     here = model.reduction.points.at(instants_of(model, [t]), jets[:, None], model.parameters)
-    return here.evaluate([pivot for _, pivot in model.equations.pivots])[0][:, 0].astype(float)
+    return here.only_values([pivot for _, pivot in model.equations.pivots])[:, 0].astype(float)
 
 
 def pivot_sizes(model):

@@ -148,7 +148,9 @@ class Path(Components, Value):
             for end, rest in zip((first, last), self.rests, strict=True):
                 result[1 : rest + 1, ends & (t == end)] = 0.0  # by class, no rounding: a rank may hang on it
         result[1:, held] = 0.0
-        return result * ((2 * unit / (high - low)) ** np.arange(order + 1)[:, None])[:, :, None]
+        rates = np.ones((order + 1, len(tau)))
+        rates[1:] = 2 * unit / (high - low)
+        return result * rates.cumprod(axis=0)[:, :, None]
 
     @cached_property
     def largest(self):
