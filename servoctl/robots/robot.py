@@ -224,8 +224,7 @@ class Robot:
     def _lines(self):
         """Each link as a line from the frame of the link that carries it to its own."""
         ends = {name: self._position(*place) for name, place in self._tree.places.items()}
-        joints = [joint for joint in self._all_joints if {joint.parent, joint.child} <= set(ends)]
-        return {joint.child: [ends[joint.parent], ends[joint.child]] for joint in joints}
+        return {joint.child: [ends[joint.parent], ends[joint.child]] for joint in self._all_joints}
 
     def _position(self, body, placement):
         """Position of a link on a body, (3,) SX [m]."""

@@ -62,11 +62,7 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
     n, seed = whole("n", n), whole("seed", seed)
     _require_few(n)
     draws = {name: _draw(name, distribution) for name, distribution in distributions.items()}
-
-    def case(i):
-        return {name: _value(name, draw, _stream(seed, i, name)) for name, draw in draws.items()}
-
-    return [case(i) for i in range(n)]
+    return [{name: _value(name, draw, _stream(seed, i, name)) for name, draw in draws.items()} for i in range(n)]
 
 
 def _require_few(n):
