@@ -160,7 +160,7 @@ class Animation(Value):
         """Pixels (height, width, 3) of each frame: what stands still is drawn once."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        ax = _axes(self, None)
+        ax = _axes(replace(self, trails={}), None)
         canvas = FigureCanvasAgg(ax.figure)
         artists = [_Moving(ax, points) for points in self.shapes.values() if not _still(points, self)]
         trails = [ax.plot([], [], color=POINT, linewidth=1.6, zorder=3)[0] for _ in self.trails]
@@ -259,8 +259,6 @@ def stroboscope(run, poses=9, trail=None, ax=None, title=""):
         levels = [float(next(iter(picture.shapes.values()))[1].mean(axis=0)[k * each]) for k in range(poses)]
         ax.set_yticks(levels, [f"{picture.t[k * each]:.4g}" for k in range(poses)])
         ax.set_ylabel("t [s]")
-    for path in picture.trails.values():
-        ax.plot(*path, color=POINT, linewidth=1.6, zorder=3)
     for k in range(poses):
         for points in picture.shapes.values():
             if not _still(points, picture):
@@ -310,8 +308,6 @@ def _side_by_side(picture, each, ax, title):
     ax = _axes(replace(picture, t=picture.t[at], shapes=shapes, trails=parts, programmed={}), ax, title)
     (left, right), inches = ax.get_xlim(), ax.figure.get_size_inches()[0]
     ax.set_xlim(left - (right - left) * FOR_DIRECTIONS / max(inches - FOR_DIRECTIONS, FOR_DIRECTIONS), right)
-    for path in parts.values():
-        ax.plot(*path, color=POINT, linewidth=1.6, zorder=3)
     for k, t in enumerate(picture.t[at]):
         below = np.array([(low + high)[0] / 2, low[1] - GAP / 4 * (high - low).max()]) + place[:, k]
         ax.text(*below, f"{t:.4g} s", ha="center", va="top", color=LINE)
@@ -451,7 +447,7 @@ def _kind(points):
 
 
 def _axes(picture, ax, title=""):
-    """Axes with equal scales, the ground and the programmed paths."""
+    """Axes with equal scales, the ground, the programmed paths and the trails."""
     low, high = _corners(picture)
     across, up = (high - low) * min(ACROSS / (high - low)[0], UP / (high - low)[1])
     if ax is None:
@@ -472,6 +468,8 @@ def _axes(picture, ax, title=""):
             ax.plot(*first, color=GREY, linewidth=2.5, marker="s" if first.shape[1] == 1 else None, zorder=1)
     for path in picture.programmed.values():
         ax.plot(*path, color=GREY, linewidth=3.5, alpha=0.6, zorder=2, solid_capstyle="round")
+    for path in picture.trails.values():
+        ax.plot(*path, color=POINT, linewidth=1.6, zorder=3)
     return ax
 
 

@@ -51,7 +51,8 @@ def moving_drawing(picture, low, high, kinds):
         points = points if points.ndim == 3 else np.stack([points, points], axis=1)  # a dot is a line without length
         return [placed(points[..., i]) for i in range(0, points.shape[-1], every)]
 
-    every = _thinned(picture)
+    points = sum(lines[0].size for lines in (*picture.shapes.values(), *picture.trails.values()))
+    every = -(-points // MOST_POINTS)  # frames from one that is shown to the next
     moving = {name: frames(picture.shapes[name]) for kind in DRAWN_AS for name in kinds if kinds[name] == kind}
     trails = [placed(points[:, ::every]).split(" ") for points in picture.trails.values()]
     lines = [_drawn(GROUND, frames(points)[0]) for name, points in picture.shapes.items() if kinds[name] == "ground"]
@@ -77,12 +78,6 @@ def moving_drawing(picture, low, high, kinds):
 <script>{SCRIPT.read_text(encoding="utf-8")}</script>
 </figure>
 """
-
-
-def _thinned(picture):
-    """Frames from one that is shown to the next."""
-    points = sum(points[0].size for points in (*picture.shapes.values(), *picture.trails.values()))
-    return -(-points // MOST_POINTS)
 
 
 def _drawn(look, points):

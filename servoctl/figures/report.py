@@ -18,11 +18,13 @@ def draw_report(report):
     -------
     matplotlib.figure.Figure
     """
+    present = {
+        _growth: report.basis.internal is not None and report.basis.internal.until.size,
+        _eigenvalues: report.basis.rest,
+        _angles: report.directions is not None and report.directions.cosines,
+    }
     parts = [(_effort, name) for name in list(report.efforts)[:MOST_EFFORTS]]
-    parts += [(_growth, None)] if report.basis.internal is not None and report.basis.internal.until.size else []
-    parts += [(_eigenvalues, None)] if report.basis.rest else []
-    parts += [(_angles, None)] if report.directions is not None and report.directions.cosines else []
-    parts = parts or [(_orders, None)]
+    parts = parts + [(draw, None) for draw, found in present.items() if found] or [(_orders, None)]
     rows = -(-len(parts) // 2)
     figure, axes = style.figure(0.7 + 2.8 * rows, rows=rows, columns=min(2, len(parts)))
     for ax, (draw, name) in zip(axes.flat, parts, strict=False):

@@ -67,7 +67,6 @@ def path(run, x=None, y=None, ax=None, units=None):
     first, second, *_ = groups[0] if groups else dict.fromkeys([*names, *run.names])
     if x is None and y is None and groups:
         first, second = _upright(run, groups[0])
-    across, up = (None if name is None else run[name] for name in (x, y))
     x = (first if y != first else second) if x is None else x
     y = (second if x != second else first) if y is None else y
     across, up = run[x], run[y]
@@ -172,8 +171,12 @@ def actuation(run, ax=None, units=None, names=None):
     require_kind(Run, "run", run, SOURCE)
     names = efforts(run) if names is None else texts(names, "The names of signals")
     if not names:
-        rule = "It needs a model, or stored signals."
-        raise SpecificationError("The run has no actuation.", rule, do="Give names of signals.", names=run.names)
+        raise SpecificationError(
+            "The run has no actuation.",
+            "It needs a model, or stored signals.",
+            do="Give names of signals.",
+            names=run.names,
+        )
     return over_time(run, [[name] for name in names], ax, units_in(run, units), extrema=True)
 
 
@@ -237,13 +240,13 @@ def save_figures(run, folder, units=None, title=""):
     """
     require_kind(Run, "run", run, SOURCE)
     text("title", title)
-    drawn = {"path": path} if planes(run) else {}
-    drawn |= {"coordinates": signals}
-    if efforts(run):
-        drawn["actuation"] = actuation
-    if len(run.residual):
-        drawn["residuals"] = lambda run, units: residuals(run)
-    drawn = {name: draw(run, units=units) for name, draw in drawn.items()}
+    draws = {
+        "path": path if planes(run) else None,
+        "coordinates": signals,
+        "actuation": actuation if efforts(run) else None,
+        "residuals": (lambda run, units: residuals(run)) if len(run.residual) else None,
+    }
+    drawn = {name: draw(run, units=units) for name, draw in draws.items() if draw}
     files = []
     with writing(folder, "figures", folder=True) as folder:
         for name, axes in drawn.items():

@@ -144,14 +144,13 @@ def _adding(jacobians, kept=()):
     kept = list(kept)
     for i in range(jacobians[0].shape[0] if jacobians else 0):
         trial = [*kept, i]
-        if i not in kept and any(_full_rank(jacobian[trial]) for jacobian in jacobians):
+        if i not in kept and any(_rank(jacobian[trial]) == len(trial) for jacobian in jacobians):
             kept = trial
     return sorted(kept)
 
 
-def _full_rank(matrix):
-    singular = np.linalg.svd(matrix, compute_uv=False)
-    return len(singular) == len(matrix) and singular[-1] > FOLLOWS * max(1.0, singular[0])
+def _rank(matrix):
+    return np.linalg.matrix_rank(matrix, FOLLOWS * max(1.0, np.linalg.norm(matrix, 2)))
 
 
 def _refuse_contradiction(names, kept, evaluate, places, q):

@@ -23,7 +23,7 @@ class Axis:
         """What turns and what slides of a value, rate or acceleration of the joint, in the body's axes."""
         if self.motion == "free":
             return jet[3:], jet[:3]
-        along, nothing = along_z(jet[0]), ca.SX.zeros(3)
+        along, nothing = ca.vertcat(0, 0, jet[0]), ca.SX.zeros(3)
         return (along, nothing) if self.motion == "turn" else (nothing, along)
 
     @property
@@ -152,11 +152,6 @@ def _local(axis):
         return quaternion_rotation(*axis.value[3:].elements())
     c, s = ca.cos(axis.value), ca.sin(axis.value)
     return ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
-
-
-def along_z(value):
-    """The vector (0, 0, value)."""
-    return ca.vertcat(0, 0, value)
 
 
 def _inertial_load(inertial, omega, alpha, acceleration):

@@ -7,7 +7,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import array_of, as_list, column, finite, mapping, named, numbers_by_name, texts, within
+from servoctl.checks import array_of, as_list, by_name, column, finite, mapping, named, numbers_by_name, texts, within
 from servoctl.errors import SpecificationError
 from servoctl.robots.description import described
 from servoctl.robots.dynamics import Kinematics, inverse_dynamics, kinetic_energy, mass_matrix, potential_energy
@@ -83,7 +83,10 @@ class Robot:
         self.position = {
             name: (j.lower, j.upper) for name, j in moving.items() if math.isfinite(j.lower) or math.isfinite(j.upper)
         }
-        self.damping, self.friction, self.armature = map(self._resistances, ("damping", "friction", "armature"))
+        self.damping, self.friction, self.armature = (
+            {name: getattr(joint, key) for name, joint in moving.items() if getattr(joint, key)}
+            for key in ("damping", "friction", "armature")
+        )
 
     def __repr__(self):
         return f"Robot {self.name!r}: {self.q.n} degrees of freedom\n  coordinates {' '.join(self.q.names)}"
@@ -124,8 +127,7 @@ class Robot:
             If one is no coordinate.
         """
         numbers = {name: self.q.identity.get(name, 0.0) for name in self.q.names}
-        for name, value in mapping(at, "The posture").items():
-            numbers[named(name, self.q.names, "coordinate")] = finite(name, value, "coordinate")
+        numbers |= numbers_by_name(at, self.q.names, "coordinate", "coordinate")
         posture = np.array(list(numbers.values()))
         for e in (list(places) for places, _ in self.q.spheres):
             posture[e] = _unit([self.q.names[i] for i in e], posture[e])
@@ -197,8 +199,8 @@ class Robot:
         """
         names, driven = self.q.force_names, self._driven(actuators)
         total = {name: ca.SX(0) for name in names}
-        for name, value in mapping(forces, "The forces").items():
-            named(name, names, "coordinate" if self.q.plain else "quasi-velocity")
+        what = "coordinate" if self.q.plain else "quasi-velocity"
+        for name, value in by_name(forces, names, what, "The forces").items():
             total[name] += column(value, f"the force on {name!r}", 1)[0]
         for name, value in zip(names, self._resistance(friction, armature).elements(), strict=True):
             total[name] += value
@@ -214,9 +216,7 @@ class Robot:
             constraints=constraints,
             outputs=outputs,
             shapes=self._lines(),
-            limits={
-                name: value for name, value in (self.effort | self.position).items() if name in (*driven, *self.q.names)
-            },
+            limits={n: limit for n, limit in (self.effort | self.position).items() if n in (*driven, *self.q.names)},
         )
         mechanism.passive = tuple(self.effort.keys() - mechanism.actuators)
         return mechanism
@@ -224,14 +224,12 @@ class Robot:
     def _lines(self):
         """Each link as a line from the frame of the link that carries it to its own."""
         ends = {name: self._position(*place) for name, place in self._tree.places.items()}
-        joints = [joint for joint in self._all_joints if {joint.parent, joint.child} <= set(ends)]
-        return {joint.child: [ends[joint.parent], ends[joint.child]] for joint in joints}
+        return {joint.child: [ends[joint.parent], ends[joint.child]] for joint in self._all_joints}
 
     def _position(self, body, placement):
         """Position of a link on a body, (3,) SX [m]."""
         offset = ca.SX(ca.DM(placement.offset))
-        moving = body is not None
-        return self._kinematics.offsets[body] + self._kinematics.rotations[body] @ offset if moving else offset
+        return offset if body is None else self._kinematics.offsets[body] + self._kinematics.rotations[body] @ offset
 
     @cached_property
     def _kinematics(self):
@@ -249,16 +247,11 @@ class Robot:
             body = self._tree.bodies[body].parent
         return result
 
-    def _resistances(self, key):
-        """Coefficients of a kind by coordinate."""
-        return {name: getattr(j, key) for name, j in self._moving.items() if getattr(j, key)}
-
     def _resistance(self, friction, armature=None):
         """Generalised forces of damping, friction and the inertia of rotors, (n,) SX."""
         if friction is None and self.friction:
-            named = ", ".join(self.friction)
             raise SpecificationError(
-                f"The joints {named} have dry friction."[:500],
+                f"The joints {', '.join(self.friction)} have dry friction."[:500],
                 "Dry friction jumps where a joint stops; servoctl takes it smoothed, as c tanh(v / friction).",
                 do="Pass friction=0.01, a speed in rad/s or m/s, or friction=0 to leave it out.",
                 joints=list(self.friction),
@@ -329,7 +322,8 @@ def urdf(source, base="fixed", lock=None, symbolic=(), gravity=9.81) -> Robot:
     description, lock = with_followers(description, lock)
     bodies = tree(description, base, lock, inertials)
     require_possible(bodies, parameters)
-    robot = Robot(description, bodies, _field(gravity), parameters)
+    gravity = [0.0, 0.0, -finite("gravity", gravity)] if as_list(gravity) is None else gravity
+    robot = Robot(description, bodies, array_of("gravity", gravity, 3), parameters)
     if unstated := [name for name, joint in robot._moving.items() if min(joint.effort, joint.velocity) <= 0.0]:
         said = f"An effort or a velocity of {', '.join(unstated)} is 0 or less in the file, which states no limit"
         warnings.warn(f"{said}. State it there, or pass limits={{...}} to sv.plant.", RuntimeWarning, stacklevel=2)
@@ -351,9 +345,3 @@ def _unit(names, quaternion):
             unit=unit.tolist(),
         )
     return quaternion / length
-
-
-def _field(gravity):
-    """The vector of gravity."""
-    along_z = as_list(gravity) is None
-    return array_of("gravity", [0.0, 0.0, -finite("gravity", gravity)] if along_z else gravity, 3)

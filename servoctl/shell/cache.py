@@ -12,12 +12,11 @@ def add_cache(cache):
 def _cache(args):
     if args.clear:
         clear()
-    libraries, derived = ([(path, size) for _, size, path in entries(folder)] for folder in folders())
-    groups = {"libraries": libraries, "derivations": derived}
+    sizes = {"libraries": [], "derivations": [], "temporary": []}
+    for kind, folder in zip(sizes, folders(), strict=False):
+        for _, size, path in entries(folder):
+            sizes["temporary" if path.endswith(".tmp") else kind].append(size)
     print(folders()[0])
-    for name, group in groups.items():
-        finished = [size for path, size in group if not path.endswith(".tmp")]
-        print(f"  {name:11}  {len(finished):6}  {sum(finished) / 1e6:8.1f} MB")
-    temporary = [size for path, size in libraries + derived if path.endswith(".tmp")]
-    print(f"  {'temporary':11}  {len(temporary):6}  {sum(temporary) / 1e6:8.1f} MB")
+    for kind, group in sizes.items():
+        print(f"  {kind:11}  {len(group):6}  {sum(group) / 1e6:8.1f} MB")
     return 0

@@ -1,6 +1,6 @@
 """`servoctl list`: the gallery's scenes, without importing their mechanisms."""
 
-from itertools import groupby
+from itertools import groupby, starmap
 from textwrap import fill
 
 from servoctl.gallery import gallery
@@ -18,7 +18,7 @@ def add_list(listing):
 
 def _list(args):
     if args.long:
-        print(*map(_of_subject, subjects()), sep="\n\n")
+        print(*starmap(_of_subject, subjects()), sep="\n\n")
         return 0
     width = max(map(len, gallery))
     for name, scene in gallery.items():
@@ -32,8 +32,7 @@ def subjects():
         yield group, dict(members)
 
 
-def _of_subject(subject):
-    group, members = subject
+def _of_subject(group, members):
     return "\n".join([group.capitalize(), *(f"\n  {name}\n{_details(scene)}" for name, scene in members.items())])
 
 

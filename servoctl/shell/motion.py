@@ -24,8 +24,12 @@ def described(args, scene, report, require=lambda model: None):
     span = as_span(tuple(args.t_span or scene.t_span))
     if args.t_span and span[1] < span[0]:
         given, forward = (f"--t-span {a:g} {b:g}" for a, b in (span, span[::-1]))
-        do = "To run backwards, set T_SPAN in a scene's file."
-        raise SpecificationError(f"{given} runs backwards in time.", nearest=f"{forward}.", do=do, t_span=span)
+        raise SpecificationError(
+            f"{given} runs backwards in time.",
+            nearest=f"{forward}.",
+            do="To run backwards, set T_SPAN in a scene's file.",
+            t_span=span,
+        )
     changes, held, guess = (by_name(getattr(args, name), f"--{name}") for name in ("set", "hold", "guess"))
     model = with_parameters(model_of(scene, [*held, *guess]), changes)
     require(model)

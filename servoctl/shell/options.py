@@ -29,8 +29,13 @@ def by_name(pairs, option):
     for name, value in pairs:
         if name in values:
             both = " and ".join(f"{v:g}" if isinstance(v, float) else str(v) for v in (values[name], value))
-            given = f"{option} {name} was given twice: {both}."
-            raise SpecificationError(given, do="Leave one out.", option=option, name=name, values=(values[name], value))
+            raise SpecificationError(
+                f"{option} {name} was given twice: {both}.",
+                do="Leave one out.",
+                option=option,
+                name=name,
+                values=(values[name], value),
+            )
         values[name] = value
     return values
 
@@ -85,13 +90,11 @@ def _limits(text):
     return (low, high) if low < high else None
 
 
-def _drift(text):
-    return text if text in ("none", "project") else float(text)
-
-
 whole, samples = _at_least(0), _at_least(2, MOST_SAMPLES)
 positive = _typed(_number(above=0.0), "not a positive number")
-drift = _typed(_drift, "not none, project or a time constant [s]")
+drift = _typed(
+    lambda text: text if text in ("none", "project") else float(text), "not none, project or a time constant [s]"
+)
 _pair = "not NAME=VALUE with a number, such as theta=0.1; the scene's name comes before such options"
 assignment = _named(_number(), _pair)
 deviation = _named(_number(least=0.0), "not NAME=STD with STD >= 0, such as theta=0.001")

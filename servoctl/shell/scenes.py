@@ -9,6 +9,7 @@ from pathlib import Path
 import servoctl as sv
 from servoctl.checks import is_number
 from servoctl.errors import ServoError, SpecificationError, unknown
+from servoctl.gallery import Scene, gallery
 from servoctl.model.model import including
 
 _MODULE = "servoctl_scene"  # name of the module made from a user's file, so that it shadows no other module
@@ -20,8 +21,6 @@ def find_scene(given):
     The file is a .py file that defines `scene()` -> (Mechanism, Program), and optionally START, GUESS, T_SPAN and UNITS
     (see `servoctl.gallery`). The first line of its docstring is the description.
     """
-    from servoctl.gallery import gallery
-
     if given in gallery:
         return given, gallery[given]
     path = Path(given)
@@ -54,8 +53,6 @@ def _module(path):
 
 
 def _from_file(path):
-    from servoctl.gallery import Scene
-
     module = _module(path)
     scene = getattr(module, "scene", None)
     if not callable(scene):
@@ -109,11 +106,8 @@ def _place(error, path):
 
 
 def _built(path, scene):
-    from servoctl.spec.mechanism import Mechanism
-    from servoctl.spec.program import Program
-
     match value := _reported(path, scene):
-        case [Mechanism(), Program()]:
+        case [sv.Mechanism(), sv.Program()]:
             return tuple(value)
         case [*items]:
             kinds = f"({', '.join(type(item).__name__ for item in items)})"
@@ -130,13 +124,10 @@ def _built(path, scene):
 
 def _advice(module):
     """What to do in a file without scene()."""
-    from servoctl.spec.mechanism import Mechanism
-    from servoctl.spec.program import Program
-
     functions = [n for n, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == _MODULE]
     if functions:
         return f"Define scene(). The file defines {', '.join(f'{name}()' for name in functions[:5])}."
-    if any(isinstance(v, (Mechanism, Program)) for v in vars(module).values()):
+    if any(isinstance(v, (sv.Mechanism, sv.Program)) for v in vars(module).values()):
         return "Return the mechanism and the program, which it makes outside any function, from scene()."
     return "Define scene()."
 
@@ -158,6 +149,7 @@ def _settings(path, module):
     for name, value in settings.items():
         check, example = SETTINGS[name]
         if not check(value):
-            rule = f"{name} has the form {example}."
-            raise SpecificationError(f"{path} sets {name} = {value!r}.", rule, file=str(path), name=name)
+            raise SpecificationError(
+                f"{path} sets {name} = {value!r}.", f"{name} has the form {example}.", file=str(path), name=name
+            )
     return {name.lower(): value for name, value in settings.items()}

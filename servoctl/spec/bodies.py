@@ -31,7 +31,10 @@ def particle(q: Coordinates, mass, position):
     SpecificationError
         If the position is no expression or depends on velocities.
     """
-    acceleration = _acceleration(q, position, "the particle's position")
+    require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
+    position = ca.vertcat(*column(position, "the particle's position", 1, 2, 3))
+    require_order(q, position, "the particle's position", 0)
+    acceleration = q.dt(position, 2)
     (mass,) = column(mass, "the mass", 1)
     return mass * ca.dot(acceleration, acceleration) / 2
 
@@ -74,7 +77,8 @@ def rigid_body(q: Coordinates, mass, inertia, position=None, rotation=None, rate
     require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
     column(mass, "the mass", 1)
     omega = body_rates(q, rotation) if rates is None else ca.vertcat(*column(rates, "rates", 3))
-    alpha, J = q.dt(omega), _inertia(inertia)
+    alpha, J = q.dt(omega), matrix(inertia, "the inertia", (3, 3), (3, 1), (1, 3))
+    J = J if J.shape == (3, 3) else ca.diag(J)
     spin = ca.dot(alpha, J @ alpha) / 2 + ca.dot(alpha, ca.cross(omega, J @ omega))
     if rates is not None and q.order(J) < 0 and not ca.depends_on(J, q.t):
         _refuse_rates(q, omega, alpha, J)
@@ -135,15 +139,3 @@ def _refuse_rates(q, omega, alpha, J):
             do="Pass rotation=R, or the rates Rᵀω along the body's axes, which are right-handed.",
             inertial=not mirrored,
         )
-
-
-def _acceleration(q, position, what):
-    require_kind(Coordinates, "q", q, 'sv.coordinates("x y")')
-    position = ca.vertcat(*column(position, what, 1, 2, 3))
-    require_order(q, position, what, 0)
-    return q.dt(position, 2)
-
-
-def _inertia(inertia):
-    inertia = matrix(inertia, "the inertia", (3, 3), (3, 1), (1, 3))
-    return inertia if inertia.shape == (3, 3) else ca.diag(inertia)

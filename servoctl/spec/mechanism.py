@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import by_name, column, distinct, interval, mapping, named, require_kind
+from servoctl.checks import by_name, column, distinct, interval, mapping, require_kind
 from servoctl.errors import NameUnknown, SpecificationError, unknown
 from servoctl.jets.branches import Branches
 from servoctl.jets.identity import spread, vanish
@@ -501,18 +501,17 @@ class Mechanism(Shown):
         return self.q.on_spheres(expression)
 
     def _named(self, values, what):
-        named = mapping(values, f"The {what}s").items()
-        return {name: self._known(value, f"{what} {name!r}") for name, value in named}
+        items = mapping(values, f"The {what}s").items()
+        return {name: self._known(value, f"{what} {name!r}") for name, value in items}
 
     def _forces(self, forces):
         if forces is None:
             return ca.SX.zeros(self.q.n)
         if not isinstance(forces, dict):
             return self._known(forces, "the forces", self.q.n)
-        names = self.q.force_names
-        total = ca.SX.zeros(self.q.n)
-        for name, value in forces.items():
-            named(name, names, "coordinate" if self.q.plain else "quasi-velocity")
+        names, total = self.q.force_names, ca.SX.zeros(self.q.n)
+        what = "coordinate" if self.q.plain else "quasi-velocity"
+        for name, value in by_name(forces, names, what, "The forces").items():
             total[names.index(name)] += self._known(value, f"the force on {name!r}")
         return total
 
@@ -690,10 +689,9 @@ def require_known(expression, mechanism, what):
                 raise error
             names = ["t", *q.names, *q.jet_names(1), *q.jet_names(2), *mechanism.parameters.names]
             hint = unknown(s.name(), names, "symbol")
-            same = s.name() in names
             raise SpecificationError(
                 f"{what} depends on the symbol {s.name()!r}"
-                + (", which has the name of a known symbol but is another one." if same else "."),
+                + (", which has the name of a known symbol but is another one." if s.name() in names else "."),
                 "Symbols are the coordinates, their derivatives, the parameters and t.",
                 nearest=f"{hint.details['match']!r}." if hint.details.get("match") else "",
                 do="Use the symbols of sv.coordinates and pass parameters=sv.parameters(...) to the mechanism.",

@@ -4,6 +4,8 @@ import itertools
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from servoctl.checks import MOST_CASES, as_list, plain, whole
 from servoctl.errors import SpecificationError
 
@@ -60,11 +62,7 @@ def monte_carlo(n: int, /, *, seed: int, **distributions) -> list[dict]:
     n, seed = whole("n", n), whole("seed", seed)
     _require_few(n)
     draws = {name: _draw(name, distribution) for name, distribution in distributions.items()}
-
-    def case(i):
-        return {name: _value(name, draw, _stream(seed, i, name)) for name, draw in draws.items()}
-
-    return [case(i) for i in range(n)]
+    return [{name: _value(name, draw, _stream(seed, i, name)) for name, draw in draws.items()} for i in range(n)]
 
 
 def _require_few(n):
@@ -80,8 +78,6 @@ def _require_few(n):
 
 def _stream(seed, index, name):
     """A numpy Generator for each seed, index of the case and name of the parameter."""
-    import numpy as np
-
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, index, *name.encode())))
 
 
@@ -90,8 +86,6 @@ def generator(seed, index):
 
     It does not depend on other cases, their order, or where they run.
     """
-    import numpy as np
-
     return np.random.Generator(np.random.Philox(key=seed % 2**128, counter=[0, index, CASES, 0]))
 
 
@@ -143,16 +137,18 @@ def as_columns(cases):
 
 def _are_numbers(column):
     """Whether a column is an array (N,) of finite numbers."""
-    import numpy as np
-
     numeric = isinstance(column, np.ndarray) and column.ndim == 1 and column.dtype.kind in "iuf"
     return numeric and len(column) > 0 and bool(np.isfinite(column).all())
 
 
 def _case(i, case):
     if not isinstance(case, Mapping):
-        rule, example = "A case must be a dict of parameters.", 'Give a dict such as {"m_load": 100.0}.'
-        raise SpecificationError(f"Case {i} is {case!r}.", rule, do=example, case=i)
+        raise SpecificationError(
+            f"Case {i} is {case!r}.",
+            "A case must be a dict of parameters.",
+            do='Give a dict such as {"m_load": 100.0}.',
+            case=i,
+        )
     values = {}
     for name, value in case.items():
         if not isinstance(name, str) or name in RESERVED:
@@ -215,5 +211,8 @@ def _value(name, draw, rng):
     try:
         return draw(rng)
     except (TypeError, ValueError) as error:
-        rule = "Each case draws one number from the distribution with a numpy Generator."
-        raise SpecificationError(f"{name} cannot be drawn: {error}.", rule, name=name) from error
+        raise SpecificationError(
+            f"{name} cannot be drawn: {error}.",
+            "Each case draws one number from the distribution with a numpy Generator.",
+            name=name,
+        ) from error

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servoctl.checks import MOST_COUNT, as_numbers, mapping, whole
+from servoctl.checks import MOST_COUNT, as_numbers, mapping, require_kind, whole
 from servoctl.codegen.function import Compiled
 from servoctl.control.batch import Gathered, run_batch, unit
 from servoctl.control.close import close, require_consistent
@@ -108,13 +108,7 @@ def close_many(
 
 
 def _require(run):
-    if not isinstance(run, Closed):
-        raise SpecificationError(
-            f"Expected a Closed, got a {type(run).__name__}.",
-            "Cases are one closed loop with different numbers.",
-            do="Pass the Closed of sv.close.",
-            kind=type(run).__name__,
-        )
+    require_kind(Closed, "run", run, "sv.close(...)")
     if not isinstance((run.law.allocation or run).law.step, Compiled):
         raise SpecificationError(
             f"The law {run.law.name!r} is computed in Python.",

@@ -72,8 +72,9 @@ class Deadline:
         now = time.perf_counter()
         self.since, self.steps = self.since or now, self.steps + 1
         if now - self.since > self.seconds:
-            late = f"More than {self.seconds:g} s: ended at t = {t:.4g} s"
-            raise LimitExceeded(late, seconds=self.seconds, steps=self.steps, t=t)
+            raise LimitExceeded(
+                f"More than {self.seconds:g} s: ended at t = {t:.4g} s", seconds=self.seconds, steps=self.steps, t=t
+            )
 
 
 class Comparison:

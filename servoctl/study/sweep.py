@@ -157,8 +157,9 @@ def _fitting_seed(case, parameters, seed):
     try:
         signature = inspect.signature(case)
     except (TypeError, ValueError) as error:
-        rule = "A case must be a function of its parameters."
-        raise SpecificationError(f"The case is {case!r}.", rule, type=type(case).__name__) from error
+        raise SpecificationError(
+            f"The case is {case!r}.", "A case must be a function of its parameters.", type=type(case).__name__
+        ) from error
     draws = "rng" in signature.parameters
     if draws != (seed is not None):
         given = f"seed = {seed!r} was given" if seed is not None else "No seed was given"

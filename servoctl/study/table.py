@@ -18,6 +18,7 @@ from servoctl.units import unit_of_column, with_unit
 from servoctl.values import frozen
 from servoctl.version import __version__
 
+ENTRIES = bool, int, float, str, np.number, np.bool_
 SHOWN, MOST_COLUMNS = 7, 12  # rows of a table in a repr, and columns
 
 
@@ -49,8 +50,9 @@ class Study(Shown):
         object.__setattr__(self, "meta", mapping(self.meta, "The facts"))
         lengths = {name: len(values) for name, values in columns.items()}
         if len(set(lengths.values())) > 1:
-            given, rule = f"The columns have the lengths {lengths}.", "All columns must have the same length."
-            raise SpecificationError(given, rule, lengths=lengths)
+            raise SpecificationError(
+                f"The columns have the lengths {lengths}.", "All columns must have the same length.", lengths=lengths
+            )
         object.__setattr__(self, "columns", columns)
 
     def __len__(self) -> int:
@@ -73,8 +75,9 @@ class Study(Shown):
         keep = np.ones(len(self), dtype=bool)
         for name, value in values.items():
             if not isinstance(value, str) and not is_number(value) and not isinstance(value, bool | np.bool_):
-                rule = "A row has a number or a text."
-                raise SpecificationError(f"{name}={repr(value)[:150]} was given.", rule, name=name, value=value)
+                raise SpecificationError(
+                    f"{name}={repr(value)[:150]} was given.", "A row has a number or a text.", name=name, value=value
+                )
             keep &= self.column(name) == value
         return self.take(np.flatnonzero(keep))
 
@@ -206,7 +209,7 @@ def machine():
     """The machine that computes: processor, cores, system, compiler and versions, as a dict of plain values."""
     return {
         "processor": processor(),
-        "cores": _cores(),
+        "cores": os.cpu_count(),
         "system": f"{platform.system()} {platform.machine()}",
         "compiler": compiler() or "none: loops are interpreted",
         "versions": dict(_versions()),
@@ -219,14 +222,15 @@ def _versions():
     return {"servoctl": __version__, "python": platform.python_version()} | others
 
 
-_cores = functools.cache(os.cpu_count)
-
-
 def _array(name, values):
     """An array of numbers, None as NaN, or of texts, None as an empty one."""
     array = values if isinstance(values, np.ndarray) else None
     known = isinstance(values, (list, tuple, range)) or array is not None and array.ndim == 1
-    if not known or not (array is not None and array.dtype.kind in "biufU" or all(map(_is_entry, values))):
+    if not known or not (
+        array is not None
+        and array.dtype.kind in "biufU"
+        or all(value is None or isinstance(value, ENTRIES) for value in values)
+    ):
         raise SpecificationError(
             f"The column {name!r} is {repr(values)[:150]}.",
             "A column is a list or an array of numbers or texts, None where one is missing.",
@@ -240,10 +244,6 @@ def _array(name, values):
         return np.array(["" if value is None else str(value) for value in values])
     array = np.array([np.nan if value is None else value for value in values])
     return array.astype(float) if array.dtype == object else array  # whole numbers beyond 64 bits
-
-
-def _is_entry(value):
-    return value is None or isinstance(value, (bool, int, float, str, np.number, np.bool_))
 
 
 def _short(value):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from servoctl.checks import as_span, mapping, named, positive, positives, require_kind, text
-from servoctl.errors import LimitExceeded, ServoError, SpecificationError, unknown
+from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.markup import Shown
 from servoctl.methods.choice import (
     METHODS,
@@ -426,12 +426,15 @@ def _candidates(model, methods, drift, span, models):
         drift = (None, "project", length / TIME_CONSTANT) if models == 1 else ("project",)
     names = list(methods) if isinstance(methods, (list, tuple, dict)) else [methods]
     for method in names:
-        if not (isinstance(method, str) and method in METHODS):
-            raise unknown(method, METHODS, "method")
+        named(method, METHODS, "method")
     treatments = [as_drift(value) for value in (drift if isinstance(drift, (list, tuple)) else [drift])]
     if any(isinstance(value, Poles) and not isinstance(value.values, float) for value in treatments):
-        rule, do = "A study names each treatment by one word or number.", "Give one time constant for all rows."
-        raise SpecificationError("Poles by row were given.", rule, do=do, drift=drift)
+        raise SpecificationError(
+            "Poles by row were given.",
+            "A study names each treatment by one word or number.",
+            do="Give one time constant for all rows.",
+            drift=drift,
+        )
     given = methods if isinstance(methods, dict) else dict.fromkeys(names)
     settings = {name: _settings(name, given[name], length) for name in names}
     pairs = [(m, None) for m in names if m == "algebraic"]

@@ -178,8 +178,12 @@ def fit(t, x, smoothness=4, *, tolerance):
     tolerances = np.ravel(positives("tolerance", tolerance, "Give the noise of the samples."))
     tolerances = array_of("tolerance", tolerances.repeat(x.shape[1] if len(tolerances) == 1 else 1), x.shape[1])
     if len(t) <= degree:
-        given, rule = f"There are {len(t)} samples.", f"A spline of degree {degree} needs at least {degree + 1}."
-        raise SpecificationError(given, rule, do="Give more samples, or a lower smoothness.", samples=len(t))
+        raise SpecificationError(
+            f"There are {len(t)} samples.",
+            f"A spline of degree {degree} needs at least {degree + 1}.",
+            do="Give more samples, or a lower smoothness.",
+            samples=len(t),
+        )
     curves = [_beside(t, column, degree, most) for column, most in zip(x.T, tolerances, strict=True)]
     path = stacked(*(as_path(curve) for curve in curves))
     parts = path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, 9)

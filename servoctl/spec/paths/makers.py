@@ -180,8 +180,12 @@ def s_curve(start, end, speed, acceleration, jerk, *, t_start=0.0):
     start, end = _ends(start, end)
     distance = math.hypot(*(end - start))
     if distance == 0.0:
-        rule, do = "They differ.", "Use rest_to_rest for a path that stands still."
-        raise SpecificationError(f"start and end are both {end.tolist()}.", rule, do=do, start=end.tolist())
+        raise SpecificationError(
+            f"start and end are both {end.tolist()}.",
+            "They differ.",
+            do="Use rest_to_rest for a path that stands still.",
+            start=end.tolist(),
+        )
     v, a, j = positive("speed", speed), positive("acceleration", acceleration), positive("jerk", jerk)
     rise = min(a / j, math.sqrt(v / j), (distance / (2 * j)) ** (1 / 3))  # of the acceleration, to its largest value
     a = j * rise
@@ -357,8 +361,13 @@ def _ends(start, end):
     """Two points (dim,) of the same size, from numbers or vectors."""
     start, end = vector("start", start), vector("end", end)
     if len(start) != len(end):
-        given, rule = f"start has {len(start)} entries, end has {len(end)}.", "They are vectors of the same size."
-        raise SpecificationError(given, rule, do="Give both as many entries.", start=len(start), end=len(end))
+        raise SpecificationError(
+            f"start has {len(start)} entries, end has {len(end)}.",
+            "They are vectors of the same size.",
+            do="Give both as many entries.",
+            start=len(start),
+            end=len(end),
+        )
     return start, end
 
 

@@ -254,8 +254,13 @@ class Path(Components, Value):
         """
         _require_dim(self.dim, require_kind(Path, "other", other, "sv.paths.as_path(...)").dim)
         if "periodic" in (self.after, other.before):
-            rule, do = "A path follows the end of another one.", "Repeat neither of them."
-            raise SpecificationError("A periodic path was joined.", rule, do=do, after=self.after, before=other.before)
+            raise SpecificationError(
+                "A periodic path was joined.",
+                "A path follows the end of another one.",
+                do="Repeat neither of them.",
+                after=self.after,
+                before=other.before,
+            )
         breaks = np.append(self.breaks, other.breaks[1:] + (self.breaks[-1] - other.breaks[0]))
         coefficients = np.concatenate(of_one_degree(self.coefficients, other.coefficients))
         joint = len(self.breaks) - 1
@@ -320,8 +325,12 @@ class Path(Components, Value):
 
 def _require_dim(dim, other):
     if dim != other:
-        rule, do = "Paths are joined component by component.", "Take components, path[i], or give as many of each."
-        raise SpecificationError(f"One has {dim} components, the other {other}.", rule, do=do, dimensions=(dim, other))
+        raise SpecificationError(
+            f"One has {dim} components, the other {other}.",
+            "Paths are joined component by component.",
+            do="Take components, path[i], or give as many of each.",
+            dimensions=(dim, other),
+        )
 
 
 def vector(name, value):
@@ -427,8 +436,12 @@ def together(*paths):
     spans = [p.breaks[[0, -1]] for p in paths]
     if {p.before for p in paths} > {"periodic"} or paths[0].before == "periodic" and np.ptp(spans, axis=0).max() > near:
         given = ", ".join(f"{a:g} .. {b:g} s ({p.before})" for (a, b), p in zip(spans, paths, strict=True))
-        rule, do = "A periodic path is joined to others of the same period.", "Repeat all in one span, or none."
-        raise SpecificationError(f"The spans of the paths are {given}.", rule, do=do, spans=spans)
+        raise SpecificationError(
+            f"The spans of the paths are {given}.",
+            "A periodic path is joined to others of the same period.",
+            do="Repeat all in one span, or none.",
+            spans=spans,
+        )
     breaks = breaks[np.append(True, np.diff(breaks) > near)]
     half, classes = np.diff(breaks) / 2, np.full(len(breaks), np.inf)
     middles = breaks[:-1] + half
