@@ -118,8 +118,7 @@ def test_loops_as_along_formulas(both, law):
     assert list(new.residual) == list(old.residual)
     for name, values in old.residual.items():
         assert np.abs(new.residual[name] - values).max() < within / 10
-    largest = np.abs(old.signals).max(axis=1, keepdims=True, initial=0.0)
-    assert (np.abs(new.signals - old.signals) <= within * largest).all()
+    assert np.abs(new.signals - old.signals).max(initial=0.0) < 10 * within
     if law == "limited" and new.plant.constrained:
         assert 0 < np.mean(new.signal["bound multiplier_beam"] != 0) < 1
 
