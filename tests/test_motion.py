@@ -7,7 +7,6 @@ from scipy.integrate import DenseOutput
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.motion import Motion
-from servoctl.methods.watch import Residuals
 from servoctl.model.variants import place_of, variant_at
 
 
@@ -64,15 +63,6 @@ def test_fixed_steps_end_at_the_end_of_the_span_and_at_knots(end):
     run = sv.simulate(model, model.start(x=0.0, y=0.0, dx=0.0), (0.0, end), sv.methods.RungeKutta(4, step=0.01))
     assert run.t[-1] == end and np.all(np.diff(run.t) > 0.009)
     assert {knot for knot in run.knots if knot < end} <= {*run.t}
-
-
-@pytest.mark.parametrize("method", ["Taylor", "RadauIIA"])
-def test_a_projected_motion_that_keeps_its_residuals_needs_no_slopes_of_them(method, wheel, monkeypatch):
-    model, start = wheel
-    values, calls = Residuals.values, []
-    monkeypatch.setattr(Residuals, "values", lambda self, *given: calls.append(given[0]) or values(self, *given))
-    run = sv.simulate(model, start, (0.0, 5.0), method, drift="project")
-    assert run.success and [len(t) for t in calls] == [1]
 
 
 def test_motions_from_one_start_derive_their_variants_once(monkeypatch):

@@ -305,6 +305,49 @@ def test_a_jump_without_a_switch_is_found(method, drift):
     assert np.abs(caught.value.run["y"] - 0.1 * np.arctan(1 / (caught.value.run["x"] - 0.5))).max() < 1e-6
 
 
+@pytest.mark.parametrize(("method", "drift"), [*PAIRS, ("RK8", "project")])
+@pytest.mark.parametrize(
+    ("path", "curve"),
+    [
+        (lambda x: ca.sin(x) / x, lambda x: np.sinc(x / np.pi)),  # divides by zero, with a limit
+        (lambda x: ca.asin(0.9999 * ca.cos(x)) ** 2, lambda x: np.arcsin(0.9999 * np.cos(x)) ** 2),  # it turns beside 1
+        (lambda x: ca.sqrt(x**2 + 1e-4), lambda x: np.sqrt(x**2 + 1e-4)),
+    ],
+    ids=["a limit", "beside an end", "a narrow bend"],
+)
+def test_a_motion_passes_an_edge_at_which_its_program_is_smooth(path, curve, method, drift):
+    model, start = ideal(lambda t, x, y, dx, dy: y - path(x), x=-0.5, dx=1.0)
+    run = sv.simulate(model, start, (0.0, 1.1), method, drift=drift, t_eval=np.linspace(0.0, 1.1, 98))
+    assert run.success and run["x"][-1] > 0.3
+    assert np.abs(run["y"] - curve(run["x"])).max() < (2e-4 if method == "RK4" else 1e-5)
+
+
+def test_a_jump_is_found_backwards_and_in_a_rate():
+    """y = z atan(1/z) has a kink at z = 0, where a velocity would have to jump."""
+    model, start = ideal(lambda t, x, y, dx, dy: y - x * ca.atan(1 / x), x=-0.5, dx=1.0)
+    back = model.start(t=1.0, x=0.5, dx=1.0, y=0.5 * np.arctan(2.0))
+    for method in ("DOP853", "Taylor", "RadauIIA", "RK4"):
+        for state, span in ((start, (0.0, 1.0)), (back, (1.0, 0.0))):
+            with refused(sv.errors.IntegrationStopped, "divides by x", residual="p", level="D(p)") as caught:
+                sv.simulate(model, state, span, method)
+            run = caught.value.run
+            assert np.abs(run["y"] - run["x"] * np.arctan(1 / run["x"])).max() < 1e-6
+            assert np.all(np.sign(run["x"][:-1]) == np.sign(run["x"][0])) and abs(run["x"][-1]) < 2e-3
+
+
+def test_a_motion_looks_at_residuals_at_edges_alone(monkeypatch):
+    from servoctl.methods import edges
+
+    looked, known = [], edges.residuals
+    monkeypatch.setattr(edges, "residuals", lambda *given: looked.append(given[2]) or known(*given))
+    for residual, met in ((lambda t, x, y, dx, dy: y - ca.sin(x), 0), (lambda t, x, y, dx, dy: y - ca.sin(x) / x, 2)):
+        model, start = ideal(residual, x=-0.5, dx=1.0)
+        for method in ("Taylor", "RadauIIA"):
+            looked.clear()
+            assert sv.simulate(model, start, (0.0, 1.1), method, t_eval=[0.0, 1.1]).success
+            assert len(looked) == met
+
+
 def test_coarse_steps_are_no_jump():
     """A circle by steps of which each errs by far more than a tolerance: the user's choice."""
     model, start = ideal(lambda t, x, y, dx, dy: x**2 + y**2 - 1, x=1.0, y=0.0, dy=1.0)

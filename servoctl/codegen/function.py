@@ -234,27 +234,26 @@ class Compiled:
         self._in_loops += len(rows)
         return rows
 
-    def whole(self, start, p, tolerances, most, times, net, judged):
+    def whole(self, start, p, tolerances, most, times, net):
         """A whole motion by the Taylor method in one call, with what shows whether nothing along it needs a decision.
 
         `start` has t0, the state there and the ends of `taylor`; `times` (N,) are samples in the order of the motion.
         In `net`, at (M,) parts of each step and at a distance of instants [s], series are compared with the equations,
-        not at the end if that is a knot (its third entry); `judged` has (rtol, atol) of the states, which judge
-        "invariants". Returns rows of the steps, as `taylor` does; the jets q, γ', ..., γ^(s̄) at the samples, by
-        "settled" if there is one; and facts: how far γ^(s̄) of the series is from that of "rates" (n,), the longest
-        step (1,), the largest sizes of the states (n_x,) and, after the start, of "invariants" relative to their
-        tolerances there (m,), the least size of each pivot, 0 where its sign changes, and the largest one, and (1,) the
-        largest of the "invariants" at the end, relative to its gradient times the state. None if the steps do not reach
-        the end, samples are not finite, or nothing is compiled.
+        not at the end if that is a knot (its third entry). Returns rows of the steps, as `taylor` does; the jets q, γ',
+        ..., γ^(s̄) at the samples, by "settled" if there is one; and facts: how far γ^(s̄) of the series is from that of
+        "rates" (n,), the longest step (1,), the largest sizes of the states (n_x,), the least size of each pivot, 0
+        where its sign changes, and the largest one, and (1,) the largest of the "invariants" at the end, relative to
+        its gradient times the state. None if the steps do not reach the end, samples are not finite, or nothing is
+        compiled.
         """
         self._require_loop("taylor")
         self._place(self._library, start[0], start[1], p)
-        n, m, sizes = self.sizes["n"], self.sizes["invariants"], self.sizes
+        n, sizes = self.sizes["n"], self.sizes
         pivots = self.n_y - sizes["last"] * (n + (0 if sizes["plain"] else sizes["nq"]))
-        lengths = n, 1, self.n_x, m, pivots, pivots, 1
+        lengths = n, 1, self.n_x, pivots, pivots, 1
         rows = sizes["nq"] + sizes["top"] * n
         times = np.ascontiguousarray(times, dtype=float)
-        found = self._library.whole(start[2], tolerances, most, times, (*net, *judged), (rows, sum(lengths)))
+        found = self._library.whole(start[2], tolerances, most, times, net, (rows, sum(lengths)))
         if found is None:
             return None
         ends = list(itertools.accumulate(lengths, initial=0))

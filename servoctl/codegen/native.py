@@ -70,12 +70,12 @@ class Library:
 
     def whole(self, ends, tolerances, most, times, net, sizes):
         """Rows of the steps, jets and facts of a motion from the start in the workspace; see `Compiled.whole`."""
-        task, (inside, distance, to_knot, *judged), count = self.workspace.steps, net, len(times)
+        task, (inside, distance, to_knot), count = self.workspace.steps, net, len(times)
         task.of(ends, *tolerances, 0.0, most, None)
         jets, facts, k = np.empty((sizes[0], count)), np.empty(sizes[1]), np.empty(count, dtype=np.int64)
         places = (a.ctypes.data for a in (times, inside, k, jets, facts))
-        samples = np.array([count, len(inside), to_knot, 0, 0, 0, *places])
-        samples.view(float)[3:6] = distance, *judged
+        samples = np.array([count, len(inside), to_knot, 0, *places])
+        samples.view(float)[3] = distance
         steps = self._whole(task.pointer, argument(samples))
         return (task.log[: steps + 1].copy(), jets, facts) if steps >= 0 else None
 

@@ -9,7 +9,8 @@ import numpy as np
 from servoctl.jets.branches import Branches
 from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch, strong
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
-from servoctl.methods.watch import Watch
+from servoctl.methods.pieces import DEFAULT, Tolerance
+from servoctl.methods.switches import Switches
 from servoctl.model.pivots import pivot_sizes
 from servoctl.model.switching import switching
 from servoctl.values import frozen
@@ -62,7 +63,8 @@ class _Algebraic(Stepping):
     def run(self, t0, x0, t1, times, knots):
         """Follow the solution from x0 at t0 to t1 [s], and solve at each of the times (N,) [s]."""
         with interruptible(self.motion):
-            self._watch(t0, x0, t1)
+            self.length = abs(t1 - t0)
+            self._look_out(t0, x0)
             cuts = np.array(breakpoints((t0, t1), knots))
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
             if self._at_once(cuts, x0, times):
@@ -95,8 +97,8 @@ class _Algebraic(Stepping):
         self.progress(cuts[-1])
         return True
 
-    def _watch(self, t, x, t1):
-        """Watch for kinks and switches of the motion, if it has any, with the smooth model that holds at the start.
+    def _look_out(self, t, x):
+        """Look for kinks and switches of the motion, if it has any, with the smooth model that holds at the start.
 
         Those of forces alone change the actuation, not the motion.
         """
@@ -105,8 +107,7 @@ class _Algebraic(Stepping):
         if self.family is not None:
             branches = self.family.branches(t, x)
             self._use(self.family.at(branches))
-            self.watch = Watch(None, abs(t1 - t), self.family, exact=True, parts=1)
-            self.watch.use(self.model, branches)
+            self.switches = Switches(self.family, branches, self.length, 1, Tolerance(self.model, *DEFAULT))
 
     def _advance(self, cuts, x):
         """Follow the solution as far as the pivots allow; the instant and the state from which it goes on."""
@@ -140,15 +141,15 @@ class _Algebraic(Stepping):
 
     def _switch(self, stretch, nodes):
         """The first switch within steps between nodes, or None."""
-        if self.watch is None or len(stretch.t) < 2:
+        if self.switches is None or len(stretch.t) < 2:
             return None
 
         def states(_, times):
             found = self._states(self.f.newton(times, nodes, self.p)[0])
             return np.pad(found, ((0, 0), (0, len(times) - found.shape[1])), constant_values=np.nan)
 
-        self.watch.begin(stretch.t[0])
-        return self.watch.switch(stretch, states, lambda k, t: states(k, np.array([t]))[:, 0])
+        self.switches.start = stretch.t[0]
+        return self.switches.first(stretch, states, lambda k, t: states(k, np.array([t]))[:, 0])
 
     def _turned(self, switch, nodes, t1):
         """Go on beyond a switch, or stop there; its instant and the state."""

@@ -9,12 +9,11 @@ import numpy as np
 
 from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
-from servoctl.methods.watch import RESOLUTION, End, net
+from servoctl.methods.pieces import RESOLUTION, End, net
 from servoctl.values import frozen
 
 OFF = 1e3  # times the tolerance, which the equations may add to a step
 REPEATS = 8  # of a step at one instant, after which it is believed
-SHORTER = 1e-2  # to which part a first step is shortened that errs by far
 FUTILE = 1e-8  # of the span: a shorter step that misses the equations where the rank is lost ends the motion
 SHORTEST = 1e-12  # of the span: shorter steps are not repeated, so that a jump of the equations is passed
 
@@ -42,13 +41,12 @@ class BulkSteps(Stepping):
     def _piece(self, a, x, b, times):
         self.pending, self.forward, t = times, b >= a, a
         self._begin(a, x, b)
-        self.monitor.begin(self._pivots(a, x))
-        self.watch.begin(a)
+        self._begin_piece(a, self._pivots(a, x))
         until, repeats = b, 0
         while t != b and self.motion.stop is None:
             steps = self._steps(t, x, until)
             stretch = self._stretch(steps)
-            outcome, doubt = self._outcome(stretch, repeats < REPEATS, t == a)
+            outcome, doubt = self._outcome(stretch, repeats < REPEATS)
             until, repeats = (b, 0) if doubt is None else (doubt, 0 if outcome.steps else repeats + 1)
             last = outcome.steps
             if isinstance(outcome, End):
@@ -65,7 +63,7 @@ class BulkSteps(Stepping):
             if before < last:
                 self._record(steps, before, last)
             self.progress(t)
-            futile = doubt is not None and abs(doubt - t) < FUTILE * self.watch.span and self.monitor.lost(t, x)
+            futile = doubt is not None and abs(doubt - t) < FUTILE * self.length and self.monitor.lost(t, x)
             if isinstance(outcome, Fine) and (futile or steps.failed and last == len(steps.t) - 1):
                 self._fail(t, x, self.failure)
                 goes_on = False
@@ -73,10 +71,10 @@ class BulkSteps(Stepping):
                 self._keep_last(t, x)
         return t, x
 
-    def _outcome(self, stretch, doubts, first):
+    def _outcome(self, stretch, doubts):
         """The outcome of steps, and the instant at which the next one must end as it does not meet the equations there.
 
-        `doubts` says whether the first step may be repeated, `first` whether it is the first of its piece.
+        `doubts` says whether the first step may be repeated.
         """
         good, doubt = self._doubted(stretch) if len(stretch.t) > 1 else (0, None)
         if doubt is not None and not good and not doubts:
@@ -85,8 +83,6 @@ class BulkSteps(Stepping):
         if doubt is not None and not good:
             return Fine(0), doubt
         outcome = self._inspected(stretch.first(good) if doubt is not None else stretch)
-        if isinstance(outcome, End) and outcome.error and first and doubts and not outcome.steps:
-            return Fine(0), stretch.t[0] + SHORTER * (stretch.t[1] - stretch.t[0])
         return outcome, doubt if isinstance(outcome, Fine) else None
 
     def _retake(self, h):
@@ -94,7 +90,7 @@ class BulkSteps(Stepping):
 
     def _stretch(self, steps):
         """The steps for the monitor: they have passed their error test, and the next begin where they end."""
-        k, at, quarters = net(steps.t, self.watch.span / RESOLUTION, len(FRACTIONS) + 1)
+        k, at, quarters = net(steps.t, self.length / RESOLUTION, len(FRACTIONS) + 1)
         states = steps.at(k, at)
         y = self.f.grid(at, states, self.p)
         self.net = k, at, states, y[: self.n_x]
@@ -118,7 +114,7 @@ class BulkSteps(Stepping):
             return len(stretch.t) - 1, None
         k, at, x, rates = self.net
         h = np.diff(stretch.t)
-        inside = (at != stretch.t[k]) & (at != stretch.t[k + 1]) & (np.abs(h[k]) > SHORTEST * self.watch.span)
+        inside = (at != stretch.t[k]) & (at != stretch.t[k + 1]) & (np.abs(h[k]) > SHORTEST * self.length)
         return self._defect(stretch, h, k[inside], at[inside], x[:, inside], rates[:, inside])
 
     def _defect(self, stretch, h, k, at, x, rates):

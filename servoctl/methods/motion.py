@@ -11,8 +11,10 @@ import numpy as np
 from servoctl.dense import Dense, steps_of
 from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.methods.choice import Poles
+from servoctl.methods.edges import Edges, edge
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
-from servoctl.methods.watch import End, Watch, edge, no_model, sticks
+from servoctl.methods.pieces import DEFAULT, End, Tolerance
+from servoctl.methods.switches import Switches, no_model, sticks
 from servoctl.model.following import instants_of
 from servoctl.model.variants import derived_near
 from servoctl.reduction.orders import other_order
@@ -24,7 +26,6 @@ SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
 MOST_KEPT = 200e6  # bytes of steps: beyond them a motion is known at its samples alone
 MOST_RESERVED = 2_000_000  # samples: for more of them arrays grow, by doubling
-ADVICE = "Use a smaller rtol, another method or drift='project', or check whether the program ends or jumps there."
 
 
 @dataclass
@@ -246,15 +247,14 @@ class Stepping:
 
     rank_lost = "the step of the integrator shrinks to nothing"
     advice = "Use a larger rtol, or check whether the motion escapes."
-    watch = None  # of the residuals and switches, while steps are taken
+    switches = edges = None  # that are looked for, while steps are taken
     family = None  # the smooth models of a model with kinks or switches
     events = None  # that are looked for
     tolerances = None  # rtol and atol; None for steps of fixed length
     parts = 8  # of a step, at whose ends switching functions are evaluated; 1 where steps are short
-    projects = False  # whether ends of steps are projected before they are inspected
+    projects = False  # whether ends of steps are projected
     knots = frozenset()  # inside the span
     cuts = ()  # at which steps end: the ends of the span, and these knots
-    again = None  # shorter equal steps, where steps are of fixed length
 
     def __init__(self, model, method, drift, progress):
         self.method, self.drift, self.progress, self.motion = method, drift, progress, Motion()
@@ -273,8 +273,8 @@ class Stepping:
     def run(self, t0, x0, t1, t_eval, knots):
         """Integrate from x0 (n_x,) at t0 to t1 [s], with samples at t_eval, in this order; steps end at the knots."""
         with interruptible(self.motion):
-            self.span = t0, t1
-            self._watch(t0, x0, t1)
+            self.span, self.length = (t0, t1), abs(t1 - t0)
+            self._look_out(t0, x0)
             t, x, cuts = t0, x0, breakpoints(self.span, knots)
             at_ends = (c for c in self.span if (np.abs(np.subtract(knots, c)) <= margin_at(c, self.span)).any())
             self.cuts, self.knots = cuts, {*cuts[1:-1], *at_ends} if len(knots) else frozenset()
@@ -306,23 +306,25 @@ class Stepping:
         first, last = (forward * margin_at(c, self.span) * (c in self.knots) for c in (a, b))
         return a + first, b - last
 
-    def _watch(self, t, x, t1):
-        """Watch for the ends of smooth pieces, from the start on."""
-        self.watch = Watch(self.tolerances, abs(t1 - t), self.family, exact=False, parts=self.parts)
-        self.watch.method, self.watch.advice = self.method, self.advice if self.tolerances is None else ADVICE
-        branches = () if self.family is None else self.family.branches(t, x)
-        self.watch.use(self.model, branches, self._error_dynamics())
+    def _look_out(self, t, x):
+        """Look for the ends of smooth pieces, from the start on."""
+        self.tolerance = Tolerance(self.model, *(self.tolerances or DEFAULT))
+        self.edges = Edges(self.tolerance, self.length)
+        if self.family is not None:
+            branches = self.family.branches(t, x)
+            self.switches = Switches(self.family, branches, self.length, self.parts, self.tolerance)
 
-    def _error_dynamics(self):
-        """Coefficients of the error dynamics of each row; none without poles."""
-        if not isinstance(self.drift, Poles):
-            return ()
-        return [np.atleast_1d(np.poly(poles)).real[:0:-1] for poles in self.drift.by_row(self.model).values()]
+    def _begin_piece(self, t, pivots):
+        """Start a piece at t [s] with pivots (n_g,)."""
+        self.monitor.begin(pivots)
+        if self.switches is not None:
+            self.switches.start = t
 
     def _inspected(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
         outcome = self._smooth(stretch)
         self.motion.reaches(stretch.x[:, : outcome.steps + 1])
+        self.tolerance.accept(stretch.x[:, : outcome.steps + 1])
         return outcome if self.events is None else self._event(stretch, outcome) or outcome
 
     def _event(self, stretch, outcome):
@@ -350,19 +352,25 @@ class Stepping:
 
     def _smooth(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the smooth piece if it comes first."""
-        state = self._state_within(stretch)
-        switch = self.watch.switch(stretch, self._states_within(stretch), state) if self.family is not None else None
+        switch = None
+        if self.switches is not None:
+            switch = self.switches.first(stretch, self._states_within(stretch), self._state_within(stretch))
         if switch is not None:
             stretch = stretch.first(switch.steps)
         outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
-        left = self.watch.left(stretch.first(outcome.steps), state, self.again, self.projects)
-        if left is not None:
-            return left
+        stretch = stretch.first(outcome.steps)
+        jump = self.edges.first(self.model, stretch.t, lambda: self._continuous(stretch))
+        if jump is not None:
+            return jump
         return switch if switch is not None and isinstance(outcome, Fine) else outcome
 
     def _states_within(self, stretch):
         """X (n_x, N) from steps (N,) and times (N,), where switches are looked for."""
         return stretch.dense
+
+    def _continuous(self, stretch):
+        """X (n_x, N) from steps (N,) and times (N,), where edges are looked for: before its end is projected."""
+        return self._states_within(stretch)
 
     def _state_within(self, stretch):
         """X from (k, t) within steps, where ends of smooth pieces are located."""
@@ -376,13 +384,10 @@ class Stepping:
                 self.motion.add(self.model, [end.t], end.x[:, None], self._top(end.t, end.x)[:, None])
             return
         if end.error is not None:
-            why = "a residual leaves its tolerance"
-            singular = not end.error.details["why"] and self.monitor.lost(end.t, end.x)
-            self.motion.stop = self.monitor.singular(end.t, end.x, why) if singular else end.error
-            return
-        stuck, branches = self.watch.switches.stays(end)
+            return self.motion.end_after(end.error.details["t"], end.error)
+        stuck, branches = self.switches.stays(end)
         often = self.motion.switches[-CHATTERS:]
-        if len(often) == CHATTERS and abs(end.t - often[0]) < CHATTERS_IN * self.watch.span:
+        if len(often) == CHATTERS and abs(end.t - often[0]) < CHATTERS_IN * self.length:
             stuck = stuck or [self.family.switches[i].text for i in end.switched]
         if stuck:
             self.motion.stop = sticks(self.method, end.t, stuck)
@@ -394,14 +399,14 @@ class Stepping:
             if row and expected is not None:
                 self.motion.stop = other_order(row, end.t, free, expected)
             else:
-                self.motion.stop = no_model(self.method, end.t, self.watch.texts(end), error)
+                self.motion.stop = no_model(self.method, end.t, self.switches.texts(end), error)
             return
-        self.motion.stop = self.watch.jump(model, end)
+        self.motion.stop = self.switches.jump(self.model, model, end)
         if self.motion.stop is None:
             self.motion.switches.append(end.t)
             self._use(model)
             self._start(end.t, end.x, b)
-            self.watch.use(model, branches, self._error_dynamics())
+            self.switches.branches = branches
 
     def _start(self, t, x, b):
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
@@ -436,8 +441,6 @@ class Stepping:
     def _go_on(self, variant, t, x):
         model, self.monitor = variant
         self._use(model)
-        if self.watch is not None:
-            self.watch.use(model, self.watch.branches, self._error_dynamics())
         self.monitor.begin(self._pivots(t, x))
         self.motion.count(pivot_changes=1)
 
@@ -452,7 +455,8 @@ class Stepping:
                 self._go_on(variant, t, x)
                 return True
             outcome = outcome.otherwise
-        self.motion.end_after(outcome.t, self.monitor.singular(outcome.t, outcome.x, outcome.why))
+        stop = self.edges and self.edges.stopped(self.model, outcome.t)
+        self.motion.end_after(outcome.t, stop or self.monitor.singular(outcome.t, outcome.x, outcome.why))
         return False
 
     def _fail(self, t, x, why):

@@ -8,7 +8,7 @@ from servoctl.dense import Hermite
 from servoctl.methods.choice import Poles, Project
 from servoctl.methods.monitor import Fine, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
-from servoctl.methods.watch import FINER, End
+from servoctl.methods.pieces import End
 
 
 def tableau(name):
@@ -55,8 +55,7 @@ class RungeKuttaSteps(Stepping):
         # each call ends with a projection where steps are projected, so that the next one counts from there
         most = self.most - self.most % self.every if 0 < self.every < self.most else self.every or self.most
         done = 0
-        self.monitor.begin(self._pivots(a, x))
-        self.watch.begin(a)
+        self._begin_piece(a, self._pivots(a, x))
         while done < count and self.motion.stop is None:
             steps = min(most, count - done)
             states, pivots = self._steps(first + done * inner, x, inner, steps)
@@ -106,17 +105,24 @@ class RungeKuttaSteps(Stepping):
 
     def _inspect(self, t, states, pivots):
         """The monitor's outcome; a step across a pivot's zero has passed no error test and is repeated."""
-        outcome = self._inspected(Stretch(t, states, pivots[:, 1:, None], self._top))
-        if self.every and outcome.steps:
-            first = slice(outcome.steps + 1)
-            torn = self.watch.torn(t[first], states[:, first], self._all_rates(t[first], states[:, first]), self._finer)
-            outcome = outcome if torn is None else torn
-        return outcome
+        return self._inspected(Stretch(t, states, pivots[:, 1:, None], self._top))
 
     def _states_within(self, stretch):
         """X from steps and times within them, by polynomials through all derivatives."""
         dense = Hermite(self.model, stretch.t, self._jets(stretch.t, stretch.x))
         return lambda k, t: dense(k, t, self.p)[: self.n_x]
+
+    def _continuous(self, stretch):
+        """As `_states_within`; where steps are projected, by shorter ones from their starts that are not."""
+        if not self.every:
+            return self._states_within(stretch)
+
+        def states(k, t):
+            places = zip(stretch.t[k], stretch.x[:, k].T, t, strict=True)
+            steps = [self.f.rk(a, x, b - a, 1, self.p, self.tableau, 1, 0)[1] for a, x, b in places]
+            return np.array([x[:, -1] if x.shape[1] == 2 else np.full(self.n_x, np.nan) for x in steps]).T
+
+        return states
 
     def _state_within(self, stretch):
         """X from (k, t) within steps, by a shorter step from their start."""
@@ -125,13 +131,3 @@ class RungeKuttaSteps(Stepping):
     def again(self, t, x, h, count):
         """States (n_x, count + 1) at the ends of equal steps from t; fewer if one fails."""
         return self._steps(t, x, h, count)[0]
-
-    def _all_rates(self, t, states):
-        return self.f.grid(t, states, self.p)[: self.n_x]
-
-    def _finer(self, t, x, end):
-        """Instants, states and rates of shorter steps; what a state has drifted since its projection is no jump."""
-        x = self.f.restore(t, x, self.p) if self.every else x
-        states = self.again(t, x, (end - t) / FINER, FINER)
-        times = np.linspace(t, end, FINER + 1)[: states.shape[1]]
-        return times, states, self._all_rates(times, states)

@@ -6,9 +6,9 @@ import numpy as np
 
 from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.choice import Project
+from servoctl.methods.edges import edge
 from servoctl.methods.radau import Collocated, rates_at
 from servoctl.methods.taylor import leave_if_stiff
-from servoctl.methods.watch import edge
 
 DEGREES = {"RK45": 4, "DOP853": 7, "Radau": 3, "LSODA": 12}  # of the polynomials of dense output
 AT_ONCE = 16  # steps that are inspected together, at most: twice as many each time
@@ -99,7 +99,7 @@ class ScipySteps(BulkSteps):
         if self.taken // MANY == before // MANY:
             return False
         mark, self.mark = self.mark, self.solver.t
-        near = abs(self.mark - mark) < CREEPS * self.watch.span
+        near = abs(self.mark - mark) < CREEPS * self.length
         return near and edge(self.model, self.solver.t, self.solver.y)[0] != ""
 
     def _project(self):

@@ -20,10 +20,11 @@ from servoctl.dense import steps_of
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.methods.choice import EXPLICIT, Project
+from servoctl.methods.edges import Edges
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
-from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved
+from servoctl.methods.pieces import RESOLUTION, End, Tolerance, net
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
 from servoctl.reduction.cascade import Running
@@ -321,7 +322,7 @@ def leave_if_stiff(steps, method, limit, t, x):
     if method is None and told:
         return
     length, p = abs(t[-1] - t[0]) / (len(t) - 1), steps.model.p
-    forward, mean = np.copysign(steps.watch.span, t[-1] - t[0]), np.array([length])
+    forward, mean = np.copysign(steps.length, t[-1] - t[0]), np.array([length])
     if stiff(steps.model, t[-1:], x[:, None], p[:, None], mean, forward, limit)[0]:
         why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
         if method is not None:
@@ -376,7 +377,7 @@ class TaylorSteps(Stepping):
         return self.motion if self.motion.interrupted else super().run(t0, x0, t1, t_eval, knots)
 
     def _in_one_call(self, t0, x0, t1, t_eval, knots):
-        """Take a motion whose steps, pivots and residuals are all in order; False if one of them must be inspected."""
+        """Take a motion whose steps and pivots are all in order; False if one of them must be inspected."""
         model, watched = self.model, (self.family, self.events)
         plain = not (self.every or self.settings.jets) and np.ndim(self.tolerances[1]) == 0
         if not plain or any(what is not None for what in watched):
@@ -384,23 +385,26 @@ class TaylorSteps(Stepping):
         _, *ends = breakpoints((t0, t1), knots)
         to_knot = len(knots) > 0 and np.abs(np.subtract(knots, t1)).min() <= margin_at(t1, (t0, t1))
         p, net = np.append(model.p, np.nan), (INSIDE, abs(t1 - t0) / RESOLUTION * (1 + SAME_INSTANT), to_knot)
-        task, judged = (t0, x0, ends if len(ends) > 1 else float(t1)), resolved(*self.tolerances)
-        whole = self.f.whole(task, p, self.tolerances, self.most, t_eval, net, judged)
+        task = t0, x0, ends if len(ends) > 1 else float(t1)
+        whole = self.f.whole(task, p, self.tolerances, self.most, t_eval, net)
         if whole is None or len(whole[0]) > self.most:
             return False
-        rows, jets, (farthest, longest, states, residuals, least, most, drifted) = whole
+        rows, jets, (farthest, longest, states, least, most, drifted) = whole
         if "settled" not in self.f.others:
             top = self.rates.grid(t_eval, jets[: self.n_x], model.p)[self.n_x - self.n : self.n_x]
             off = np.abs(top - jets[-self.n :])[:, ~np.isin(t_eval, [*ends[:-1], t1] if to_knot else ends[:-1])]
             farthest, jets[-self.n :] = np.maximum(farthest, off.max(axis=1, initial=0.0)), top
         if self._far_off(farthest, float(longest[0]), states) or not np.isfinite(farthest).all():
             return False
-        if (least < DEGRADED * np.maximum(most, pivot_sizes(model))).any() or not (residuals <= LEAVES).all():
+        if (least < DEGRADED * np.maximum(most, pivot_sizes(model))).any():
+            return False
+        log, edges = _Log(self.f, self.n_x, p, rows), Edges(Tolerance(model, *self.tolerances), abs(t1 - t0))
+        if edges.first(model, log.t, lambda: lambda k, t: log.jets(k, t, self.top - 1)) is not None:
             return False
         self.motion.fill(model, t_eval, jets)
         self.motion.largest, self.motion.drifted = states, float(drifted[0])
         self.motion.count(steps=len(rows) - 1, nfev=len(rows) - 1)
-        self.motion.keep(model, rows[:, 0], self._dense(_Log(self.f, self.n_x, p, rows)), (np.nan,))
+        self.motion.keep(model, rows[:, 0], self._dense(log), (np.nan,))
         self.progress(t1)
         return True
 
@@ -435,8 +439,7 @@ class TaylorSteps(Stepping):
         return np.zeros(self.n)
 
     def _piece(self, a, x, b, times):
-        self.monitor.begin(self._pivots(a, x))
-        self.watch.begin(a)
+        self._begin_piece(a, self._pivots(a, x))
         until = b
         while a != b and self.motion.stop is None:
             p, ends = self._on_piece(a), self._until(a, until)
@@ -537,7 +540,7 @@ class TaylorSteps(Stepping):
     def _instants(self, log):
         """Steps and instants within them at which series are compared with the equations."""
         t, h = log.t, np.diff(log.t)
-        each, further, _ = net(t, self.watch.span / RESOLUTION, 1)
+        each, further, _ = net(t, self.length / RESOLUTION, 1)
         k = np.concatenate([np.repeat(np.arange(len(h)), len(INSIDE)), each])
         at = np.concatenate([(t[:-1, None] + INSIDE * h[:, None]).ravel(), further])
         within = at != t[k]

@@ -12,10 +12,10 @@
 /* Samples at `count` times in the order of the motion, whose steps are written to k and jets q, gamma', ..., gamma^(s) to
    `jets`. Series are compared with the equations at parts `inside` of each step, and at instants no farther apart than
    `distance`: at the samples, if rows determine their rates and they are as dense; not at knots, where equations have other
-   branches: the ends of `Steps` but the last one, and this if `to_knot`. rtol and atol judge invariants. */
+   branches: the ends of `Steps` but the last one, and this if `to_knot`. */
 typedef struct {
     int64_t count, parts, to_knot;
-    double distance, rtol, atol;
+    double distance;
     const double *times, *inside;
     int64_t *k;
     double *jets, *facts;
@@ -34,21 +34,6 @@ static double scaled(const double *y, const double *x)
         widen(&largest, fabs(y[i]) / (square > 0 ? sqrt(square) : 1));
     }
     return largest;
-}
-
-/* The tolerance of an invariant by that of the state x: of each entry its derivative times atol + rtol times the largest
-   entry of its level; y are the values and the Jacobian of all of them. */
-static double tolerance(const double *y, const double *x, int64_t invariant, const Whole *w)
-{
-    double sum = 0;
-    for (int64_t first = 0, end = NQ; first < NX; first = end, end += N) {
-        double largest = 0;
-        for (int64_t j = first; j < end; j++) widen(&largest, fabs(x[j]));
-        for (int64_t j = first; j < end; j++) {
-            sum += fabs(y[INVARIANTS * (1 + j) + invariant]) * (w->atol + w->rtol * largest);
-        }
-    }
-    return sum;
 }
 
 static inline double last_end(const Steps *s) { return s->ends[(int64_t)s->count - 1]; }
@@ -106,16 +91,15 @@ static void compare(const double *row, double end, int knot, int by_samples, con
      N           how far gamma^(s) of the series is at most from that of the equations
      1           the longest step
      NX          the largest size of each state at the ends of all steps
-     INVARIANTS  the largest size of each invariant after each step, relative to its tolerance at the start
      N_PIVOTS    the least size of each pivot, 0 where its sign changes
      N_PIVOTS    its largest size
      1           the largest invariant at the end, relative to its gradient times the state */
 int64_t FN(whole)(const Steps *s, const Whole *w)
 {
-    double p[NP], allowed[INVARIANTS + 1], values[OUTPUTS_OF_INVARIANTS + 1];
+    double p[NP], values[OUTPUTS_OF_INVARIANTS + 1];
     const int64_t steps = FN(taylor)(s), columns = 1 + NX + NY;
     double *end = s->log + steps * columns, *farthest = w->facts, *longest = farthest + N, *states = longest + 1;
-    double *residuals = states + NX, *least = residuals + INVARIANTS, *most = least + N_PIVOTS, *drifted = most + N_PIVOTS;
+    double *least = states + NX, *most = least + N_PIVOTS, *drifted = most + N_PIVOTS;
     const double *knot = s->ends;
     const int by_samples = dense(s, w);
     if (end[0] != last_end(s)) return -1;
@@ -125,24 +109,20 @@ int64_t FN(whole)(const Steps *s, const Whole *w)
     for (int64_t i = 0; i < N_PIVOTS; i++) least[i] = INFINITY;
     for (int64_t step = 0; step <= steps; step++) {
         const double *row = s->log + step * columns, *pivots = row + 1 + NX + N_C, *first = s->log + 1 + NX + N_C;
-        FN(invariants)(row[0], row + 1, p, values);
-        for (int64_t i = 0; i < INVARIANTS; i++) {
-            if (step && values[i] != 0) widen(residuals + i, fabs(values[i]) / allowed[i]);
-            if (!step) allowed[i] = tolerance(values, row + 1, i, w);
-        }
         for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(row[1 + i]));
         for (int64_t i = 0; i < N_PIVOTS; i++) {
             const double size = pivots[i] * first[i] > 0 ? fabs(pivots[i]) : 0;
             least[i] = size < least[i] ? size : least[i];
             widen(most + i, fabs(pivots[i]));
         }
-        if (step == steps) *drifted = scaled(values, row + 1);
         if (step == steps) break;
         widen(longest, fabs(row[columns] - row[0]));
         const int at_knot = row[columns] == *knot && (step + 1 < steps || w->to_knot);
         compare(row, row[columns], at_knot, by_samples, w, p, farthest);
         knot += row[columns] == *knot;
     }
+    FN(invariants)(end[0], end + 1, p, values);
+    *drifted = scaled(values, end + 1);
     const double forward = last_end(s) > s->start[0] ? 1 : -1;
     for (int64_t at = 0, step = 0; at < w->count; at++) {
         while (step < steps - 1 && forward * s->log[(step + 1) * columns] <= forward * w->times[at]) step++;

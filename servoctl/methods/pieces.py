@@ -1,0 +1,74 @@
+"""What ends a smooth piece of a motion, and what the tolerances of its state allow in functions of it."""
+
+import numpy as np
+
+from servoctl.methods.sizes import state_levels
+from servoctl.values import frozen
+
+LEAVES = 1e3  # times what the tolerances of the state allow in a residual: beyond, it differs from zero
+DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length
+LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
+RESOLUTION = 1000  # instants of a span, at least, at which functions of the motion are inspected within steps
+
+
+@frozen
+class End:
+    """The smooth piece ends at t [s], X = x, in the step after `steps` whole ones."""
+
+    steps: int
+    t: float
+    x: np.ndarray
+    switched: tuple = ()  # indices of the switches that the motion crosses there; none where it stops
+    branches: tuple = ()  # all branches beyond
+    error: object = None  # why it stops: a ServoError or None
+    event: str = ""  # the terminal event that ends the motion there
+
+
+def net(t, distance, least):
+    """Instants within steps with ends t (S + 1,), in at least so many equal parts, no longer than a distance [s].
+
+    Returns their steps (N,); the instants (N,) in the order of the motion, ends of steps included [s]; and whether they
+    are ends of the least parts, which all steps have, (N,).
+    """
+    h = np.diff(t)
+    parts = least * np.maximum(np.ceil(np.abs(h) / (least * distance)), 1).astype(int)
+    k, last = np.repeat(np.arange(len(h)), parts), np.cumsum(parts) - 1
+    j = 1 + np.arange(len(k)) - np.repeat(last - parts + 1, parts)
+    at = t[k] + h[k] * (j / parts[k])
+    at[last] = t[1:]
+    return k, at, j * least % parts[k] == 0
+
+
+class Tolerance:
+    """The tolerances of the state along a motion, and of functions of it; atol is a number or an array (n_x,)."""
+
+    def __init__(self, model, rtol, atol):
+        self.rtol, atol = max(rtol, LEAST_RTOL), np.maximum(atol, LEAST_ATOL)
+        self.levels = state_levels(model)
+        self.atol = np.broadcast_to(atol, len(self.levels))[:, None]
+        self.sizes = np.zeros(len(self.levels))
+
+    def of(self, slopes, x):
+        """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
+        return np.einsum("mxn,xn->mn", np.abs(slopes), self.atol + self.rtol * self._sizes(x))
+
+    def accept(self, x):
+        """Take in states (n_x, N) as part of the motion."""
+        self.sizes = np.fmax(self.sizes, np.abs(x).max(axis=1))
+
+    def _sizes(self, x):
+        """The largest size of each entry's level so far, (n_x, N)."""
+        sizes = np.fmin(np.fmax(np.abs(x), self.sizes[:, None]), np.finfo(float).max)
+        first = np.searchsorted(self.levels, range(self.levels[-1] + 1))
+        return np.maximum.accumulate(np.maximum.reduceat(sizes, first)[self.levels], axis=1)
+
+
+def residuals(model, tolerance, t, x):
+    """Residuals of all levels of the state at times t (N,) and states x (n_x, N), and `LEAVES` times their tolerances.
+
+    A residual has the tolerance |∂ψ/∂X| (atol + rtol |X|). Both are (m, N) arrays.
+    """
+    y = model.function("invariants").grid(t, x, model.p)
+    m = len(y) // (1 + len(x))
+    slopes = y[m:].reshape(len(x), m, -1).swapaxes(0, 1)
+    return y[:m], LEAVES * tolerance.of(slopes, x)
