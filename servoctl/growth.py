@@ -41,8 +41,8 @@ TURNED = 0.75  # squared sines of the angles between tangent spaces at an end of
 BLOCKS = 32  # instants between which growth is measured, as all pairs of them
 SWEEPS, BALANCED = 30, 0.01  # of balancing, at most; until sums of rows and of columns agree to one percent
 BOUNDED_AT, BOUNDED_IN = 16, 4  # intervals between the instants of a bound of the growth; sweeps of its balancing
-AT_FIRST = 256  # intervals that may tell that there is nothing to warn of
-SHORT = 1.0  # ∫‖A‖ over an interval with which they tell
+MOST_AT_FIRST = 256  # intervals, at most, that may tell that there is nothing to warn of
+SHORT = 0.7  # ∫‖A‖ over each of them, by few linearisations; the series converges below 1
 GLANCES = 128  # intervals by which these instants are spread over the way of the states
 SHARED = 0.5  # of the largest part that is independent of states chosen before: with it a state is fit as the next one
 MATTERS = 1e-3  # of the states' scales: an error as large as this matters
@@ -240,8 +240,7 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
     return judged if end is None else _with_multipliers(model, run, end, period, judged)
 
 
-@np.errstate(all="ignore")
-def growth_bound(model, run):
+def growth_bound(run):
     """A bound of the growth of errors along a run, by the logarithmic norm of its linearisation.
 
     It is exp max ∫ μ dt over all parts of the run, μ = λ_max(A + Aᵀ)/2 with A = Nᵀ J N in scaled states
@@ -249,20 +248,30 @@ def growth_bound(model, run):
     where A is not finite. One scale of the states, which balances the mean of (J N Nᵀ)², serves the whole run. A large
     bound says nothing: where A turns, an error may stay small though μ is large.
     """
-    t0, t1 = run.span
-    if t0 == t1:
-        return np.inf
-    t = _instants(run, t1, GLANCES)
-    x = run.at(t)[: len(model.state_names)]
+    return _bound(run, _few_tangents(run))
+
+
+def _few_tangents(run):
+    """Tangents at few instants of a run; None where one is not finite."""
+    if run.span[0] == run.span[1]:
+        return None
+    t = _instants(run, run.span[1], GLANCES)
+    x = run.at(t)[: len(run.model.state_names)]
     if not np.isfinite(x).all():
-        return np.inf
-    picked = _spread(t, x / _sizes(x)[:, None], _knots(run, t1))
+        return None
+    picked = _spread(t, x / _sizes(x)[:, None], _knots(run, run.span[1]))
     tangents = _linearised(run, t[picked], x[:, picked], _sizes(x))
-    t, N, JN = np.abs(tangents.t - t0), tangents.N, tangents.JN
-    if len(t) < len(picked):
+    return tangents if len(tangents.t) == len(picked) else None
+
+
+@np.errstate(all="ignore")
+def _bound(run, tangents):
+    """As `growth_bound`, from few tangents."""
+    if tangents is None:
         return np.inf
-    slopes = JN @ N.swapaxes(1, 2)
-    scale = _balance((slopes**2).mean(axis=0) + np.eye(len(x)) / t[-1] ** 2, BOUNDED_IN)[:, None]
+    (t0, t1), N, JN = run.span, tangents.N, tangents.JN
+    t, slopes = np.abs(tangents.t - t0), JN @ N.swapaxes(1, 2)
+    scale = _balance((slopes**2).mean(axis=0) + np.eye(N.shape[1]) / t[-1] ** 2, BOUNDED_IN)[:, None]
     Q, R = np.linalg.qr(N / scale)
     A = np.sign(t1 - t0) * Q.swapaxes(1, 2) @ (JN / scale) @ np.linalg.inv(R)
     mu = np.linalg.eigvalsh((A + A.swapaxes(1, 2)) / 2)[:, -1]
@@ -287,11 +296,15 @@ def _spread(t, x, knots):
 
 def quiet(run):
     """Whether a run's internal dynamics need no warning: by a bound of the growth, or by few propagators."""
-    if growth_bound(run.model, run) <= UNSTABLE:
+    few = _few_tangents(run)
+    if _bound(run, few) <= UNSTABLE:
         return True
-    tangents = _tangents(run.model, run, _instants(run, run.span[1], AT_FIRST)).in_fours()
+    count = np.inf if few is None else _frobenius(few.frozen).max() * abs(run.span[1] - run.span[0]) / SHORT
+    if not count <= MOST_AT_FIRST:
+        return False
+    tangents = _tangents(run.model, run, _instants(run, run.span[1], max(count, BLOCKS))).in_fours()
     size, corners = _frobenius(tangents.frozen), tangents[::2]
-    short = np.abs(np.diff(tangents.t)) * np.maximum(size[1:], size[:-1]) <= SHORT
+    short = np.abs(np.diff(tangents.t)) * np.maximum(size[1:], size[:-1]) < 1
     steps = _steps(tangents) if short.all() else None
     if steps is None:
         return False
