@@ -22,7 +22,7 @@ from servoctl.jets.branches import contains
 
 GRID_POINTS = 2_500  # 20 longer grids take CasADi as long as writing and loading a library, 200 as compiling it
 CALLS = 10_000  # of one point: CasADi has taken as long as compiling takes then, where the function is long
-FULLY_OPTIMISED = 6_000  # operations: up to here -O3 takes at most 1.5 s; with -O1 15,000 take no longer
+FULLY_OPTIMISED = 6_000  # statements of C: up to here -O3 takes at most 1.5 s; more are as fast with -O1
 ALONG_A_PATH = "-O2 -fno-tree-pre -fno-tree-vrp -fno-gcse -fno-tree-slp-vectorize"  # Newton: 3/4 of the time of -O3
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
 
@@ -343,7 +343,7 @@ class Compiled:
 
     @property
     def _level(self):
-        if {*self.loops} <= {"rk"} or self.operations > FULLY_OPTIMISED:
+        if {*self.loops} <= {"rk"} or self.source().count(";") > FULLY_OPTIMISED:
             return "-O1"
         return ALONG_A_PATH if self.loops == ("newton",) else "-O3"  # as fast there, with the same bits
 

@@ -4,14 +4,13 @@ The arguments of such functions are followed along the dense output of steps. Wh
 residuals on both sides tell whether they stay zero, as those with sin(z)/z do.
 """
 
-import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.dense import steps_of
 from servoctl.errors import IntegrationStopped
-from servoctl.jets.branches import domain_edges, size_of_terms
-from servoctl.methods.pieces import RESOLUTION, End, net, residuals
+from servoctl.jets.branches import domain_edges
+from servoctl.methods.pieces import RESOLUTION, End, net, residuals, terms_of
 from servoctl.model.equations import invariant_names
 from servoctl.values import frozen
 
@@ -139,7 +138,7 @@ class Edges:
             return result
         x = state(times)
         values, allowed = residuals(model, self.tolerance, times, x)
-        terms = _terms(model).grid(times, x, model.p)[:, ::-1]
+        terms = terms_of(model).grid(times, x, model.p)[:, ::-1]
         terms = np.fmax.accumulate(terms, axis=1)[:, ::-1]  # of an instant and all that are farther
         far, resolved = np.abs(times - at) > self.span / RESOLUTION, allowed <= OF_TERMS * terms
         values[np.isnan(values) & far] = np.inf
@@ -171,17 +170,6 @@ def _stop(what, at, why, row, **details):
         why=why,
         **details,
     )
-
-
-def _terms(model):
-    """The sum of the magnitudes of each residual's terms, as a function of (t, X, p)."""
-
-    def build():
-        e = model.equations
-        sizes = [size_of_terms(ca.densify(expression)) for _, _, expression in e.invariant_rows]
-        return compiled(e.function("terms", e.state, sizes), "terms")
-
-    return model.once("terms", build)
 
 
 def _least(function, a, b):

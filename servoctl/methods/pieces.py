@@ -1,7 +1,10 @@
 """What ends a smooth piece of a motion, and what the tolerances of its state allow in functions of it."""
 
+import casadi as ca
 import numpy as np
 
+from servoctl.codegen.function import compiled
+from servoctl.jets.branches import size_of_terms
 from servoctl.methods.sizes import state_levels
 from servoctl.values import frozen
 
@@ -70,5 +73,16 @@ def residuals(model, tolerance, t, x):
     """
     y = model.function("invariants").grid(t, x, model.p)
     m = len(y) // (1 + len(x))
-    slopes = y[m:].reshape(len(x), m, -1).swapaxes(0, 1)
+    slopes = y[m:].reshape(len(x), m, len(t)).swapaxes(0, 1)
     return y[:m], LEAVES * tolerance.of(slopes, x)
+
+
+def terms_of(model):
+    """The sum of the magnitudes of each residual's terms, as a function of (t, X, p)."""
+
+    def build():
+        e = model.equations
+        sizes = [size_of_terms(ca.densify(expression)) for _, _, expression in e.invariant_rows]
+        return compiled(e.function("terms", e.state, sizes), "terms")
+
+    return model.once("terms", build)

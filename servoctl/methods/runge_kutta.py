@@ -8,7 +8,10 @@ from servoctl.dense import Hermite
 from servoctl.methods.choice import Poles, Project
 from servoctl.methods.monitor import Fine, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
-from servoctl.methods.pieces import End
+from servoctl.methods.pieces import End, residuals, terms_of
+
+MUCH = 1e-2  # of its terms, by which a residual may change over a step, unless shorter ones change it less
+FINER, CLOSER = 16, 4  # shorter steps in place of one; how often, to come close to where a motion ends
 
 
 def tableau(name):
@@ -26,7 +29,7 @@ def tableau(name):
 class RungeKuttaSteps(Stepping):
     """One integration, by one of `ORDERS`, in steps of at most `step` [s] that end at knots; every step is a sample."""
 
-    rank_lost = "the state is no longer finite"
+    rank_lost = "its steps lead to no state of the program"
     advice = "Use a smaller step (stable below about 2.8 over the largest eigenvalue), slower poles, or 'DOP853'."
     parts = 1
     most = 2000  # steps per call of the compiled loop
@@ -61,7 +64,9 @@ class RungeKuttaSteps(Stepping):
             states, pivots = self._steps(first + done * inner, x, inner, steps)
             t = a + (done + np.arange(states.shape[1])) * h
             t[-1] = b if done + len(t) > count else t[-1]
-            outcome = self._inspect(t, states, pivots)
+            end = self._lost(t, states)
+            kept = slice(len(t) if end is None else end[0] + 1)
+            outcome = self._inspect(t[kept], states[:, kept], pivots[:, kept])
             good = outcome.steps
             if isinstance(outcome, End):
                 inside = np.append(t[: good + 1], outcome.t), np.column_stack([states[:, : good + 1], outcome.x])
@@ -74,8 +79,38 @@ class RungeKuttaSteps(Stepping):
             if not isinstance(outcome, Fine):
                 self._follow(outcome)
             elif good < steps:
-                self._fail(t[good], x, f"a step of {abs(h):.3g} s leads to no finite state")
+                place = (t[good], x) if end is None or good < end[0] else end[1:]
+                self._fail(*place, f"a step of {abs(h):.3g} s leads to no state of the program")
         return b, x
+
+    def _lost(self, t, states):
+        """The first step that leads off the program, also in parts, as its rank is lost there: (k, t, X); or None."""
+        values, allowed = residuals(self.model, self.tolerance, t[-1:], states[:, -1:])
+        if (np.abs(values) <= allowed).all():
+            return None
+        for k in np.flatnonzero(self._off(t, states)):
+            at, x = self._last(t[k], states[:, k], t[k + 1] - t[k])
+            if self.monitor.lost(at, x):
+                return int(k), at, x
+        return None
+
+    def _off(self, t, states):
+        """Over which steps a residual changes by much of its terms, (S,)."""
+        values, allowed = residuals(self.model, self.tolerance, t, states)
+        change, terms = np.abs(np.diff(values)), terms_of(self.model).grid(t, states, self.model.p)
+        return ((change > MUCH * terms[:, 1:]) & (change > allowed[:, 1:])).any(axis=0)
+
+    def _last(self, t, x, h):
+        """The last instant and state before a step of length h [s] leads off the program, by ever shorter ones."""
+        for _ in range(CLOSER):
+            h /= FINER
+            states = self.again(t, x, h, FINER)
+            off = np.append(self._off(t + h * np.arange(states.shape[1]), states), states.shape[1] <= FINER)
+            good = int(np.argmax(off)) if off.any() else FINER
+            t, x = t + good * h, states[:, good]
+            if good == FINER:
+                break
+        return t, x
 
     def _record(self, t, states):
         steps, jets = len(t) - 1, self._jets(t, states)

@@ -31,7 +31,6 @@ def derived_near(model, t, jets, sizes=()):
     """
     jets = np.asarray(jets, dtype=float) + 0.0  # without the sign of a zero
     default = model.once("jet sizes", lambda: model.equations.jet_sizes)
-    model._store.require_unchanged()
     sizes = {name: size for name, size in dict(sizes).items() if size > ENTRY * default.get(name, 0.0)}
     state = dict(zip(model.jet_names, jets.tolist(), strict=True)) | references_at(required_paths(model.paths), t)
     place = (float(t), state, default | sizes)
@@ -75,6 +74,7 @@ def _near(base, place):
 
 
 def _derived(base, place, values):
+    base._store.require_unchanged()
     r = base.reduction
     guess = None if r.context.scales is None else base._store.specification[2] or {}
     return base._of(r.mechanism, r.program, guess, place, values)
