@@ -23,6 +23,7 @@ from servoctl.methods.choice import EXPLICIT, Project
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
+from servoctl.methods.sizes import from_start
 from servoctl.methods.watch import LEAVES, RESOLUTION, End, net, resolved
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
@@ -502,8 +503,8 @@ class TaylorSteps(Stepping):
         off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
         rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
         h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
-        farthest, states = off.max(axis=1), np.abs(log.states).max(axis=1)
-        for level, (entries, largest) in self._far_off(farthest, h.max(), states).items():
+        farthest, states = off.max(axis=1), np.abs(from_start(self.model, log.states, self.x0)).max(axis=1)
+        for level, (entries, largest) in self._far_off(farthest, h.max(), np.fmax(states, self.motion.largest)).items():
             part, missed, highest = perm(last, level) / perm(last, self.top - 1), off[entries], top[entries]
             if weights is not None and (level or self.plain):
                 w = weights[self._level(level), None][entries]
@@ -517,7 +518,8 @@ class TaylorSteps(Stepping):
     def _far_off(self, farthest, longest, states):
         """Levels at which series may miss the equations: entries of γ, and the largest state of the level.
 
-        `farthest` (n,) is how far γ^(s̄) is off at most, `longest` the longest step, `states` (n_x,) the largest states.
+        `farthest` (n,) is how far γ^(s̄) is off at most, `longest` the longest step, `states` (n_x,) the
+        largest states, `from_start`.
         """
         rtol, (atol, weights), last, result = self.tolerances[0], weighted(self.tolerances[1]), self.f.sizes["last"], {}
         for level, entries in _integrated_levels(self.f.sizes.get("free", (1,) * (self.n_x - self.nq)), self.n).items():

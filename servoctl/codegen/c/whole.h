@@ -37,13 +37,13 @@ static double scaled(const double *y, const double *x)
 }
 
 /* The tolerance of an invariant by that of the state x: of each entry its derivative times atol + rtol times the largest
-   entry of its level; y are the values and the Jacobian of all of them. */
-static double tolerance(const double *y, const double *x, int64_t invariant, const Whole *w)
+   entry of its level or, of q, how far it has `moved`; y are the values and the Jacobian of all of them. */
+static double tolerance(const double *y, const double *x, const double *moved, int64_t invariant, const Whole *w)
 {
     double sum = 0;
     for (int64_t first = 0, end = NQ; first < NX; first = end, end += N) {
         double largest = 0;
-        for (int64_t j = first; j < end; j++) widen(&largest, fabs(x[j]));
+        for (int64_t j = first; j < end; j++) widen(&largest, first ? fabs(x[j]) : moved[j]);
         for (int64_t j = first; j < end; j++) {
             sum += fabs(y[INVARIANTS * (1 + j) + invariant]) * (w->atol + w->rtol * largest);
         }
@@ -105,7 +105,7 @@ static void compare(const double *row, double end, int knot, int by_samples, con
    `facts` are, in this order:
      N           how far gamma^(s) of the series is at most from that of the equations
      1           the longest step
-     NX          the largest size of each state at the ends of all steps
+     NX          how far each of q has moved from the start at most at the ends of steps, and the largest size of each rate
      INVARIANTS  the largest size of each invariant after each step, relative to its tolerance at the start
      N_PIVOTS    the least size of each pivot, 0 where its sign changes
      N_PIVOTS    its largest size
@@ -123,14 +123,16 @@ int64_t FN(whole)(const Steps *s, const Whole *w)
     NAME(end[0], end + 1, p, end + 1 + NX);
     for (double *fact = farthest; fact <= drifted; fact++) *fact = 0;
     for (int64_t i = 0; i < N_PIVOTS; i++) least[i] = INFINITY;
+    for (double *row = s->log + 1; row <= end + 1; row += columns) {
+        for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(row[i] - (i < NQ ? s->log[1 + i] : 0)));
+    }
     for (int64_t step = 0; step <= steps; step++) {
         const double *row = s->log + step * columns, *pivots = row + 1 + NX + N_C, *first = s->log + 1 + NX + N_C;
         FN(invariants)(row[0], row + 1, p, values);
         for (int64_t i = 0; i < INVARIANTS; i++) {
             if (step && values[i] != 0) widen(residuals + i, fabs(values[i]) / allowed[i]);
-            if (!step) allowed[i] = tolerance(values, row + 1, i, w);
+            if (!step) allowed[i] = tolerance(values, row + 1, states, i, w);
         }
-        for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(row[1 + i]));
         for (int64_t i = 0; i < N_PIVOTS; i++) {
             const double size = pivots[i] * first[i] > 0 ? fabs(pivots[i]) : 0;
             least[i] = size < least[i] ? size : least[i];
