@@ -203,10 +203,9 @@ class Interpreter:
     def taylor(self, ends, rtol, atol, every, max_steps, weights=None):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
-        start, n_x = self.workspace.start.copy(), self._n_x
+        start, n_x, moved = self.workspace.start.copy(), self._n_x, 0.0
         t, x, p, rows, (t1, *later) = start[0], start[1 : 1 + n_x], start[1 + n_x :], [], np.atleast_1d(ends)
         p[-1] = (t + t1) / 2
-        x0, moved = x[:nq], 0.0
         free = np.array(self._sizes.get("free", [1] * (n_x - nq)), dtype=bool).reshape(top - 1, n)
         w = np.ones(n_x) if weights is None else weights
         while True:
@@ -220,7 +219,7 @@ class Interpreter:
             of_q = y[: nq * last].reshape(last, nq)
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
             levels = zip(*(part[nq:].reshape(top - 1, n) for part in (x, w)), free, strict=True)
-            moved = np.abs(w[:nq] * (x[:nq] - x0)).max(initial=moved)
+            moved = np.abs(w[:nq] * (x[:nq] - start[1 : 1 + nq])).max(initial=moved)
             of_rates = (longest((u * v)[i], (u * c)[:, i], j, rtol, atol) for j, (v, u, i) in enumerate(levels, 1))
             h = rough_exp2(min(longest(moved, w[:nq] * of_q, 0, rtol, atol), *of_rates))
             if not h > 1e-13 * (1 + abs(t)):
@@ -382,12 +381,10 @@ def longest(level, c, j, rtol, atol):
     k = k[k > max(j, 1)]
     falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
     scale, log_rtol = rough_log2(atol / rtol + np.max(np.abs(level), initial=0.0)), np.log2(LAST_TERM * rtol)
-    sizes = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0))
+    rate, sizes = (rough_log2(np.abs(some).max(axis=1, initial=0.0)) for some in (c[:1], c[k - 1]))
     h = log_rtol / (last - j) + (scale - sizes - rough_log2(falling)) / (k - j)
-    if j == 0:
-        rate = rough_log2(np.abs(c[0]).max(initial=0.0))
-        h = np.maximum(h, log_rtol / (last - 1) + (rate - sizes) / (k - 1))
-    return np.min(h, initial=np.inf)
+    of_way = log_rtol / (last - 1) + (rate - sizes) / (k - 1)
+    return np.min(h if j else np.maximum(h, of_way), initial=np.inf)
 
 
 def _distance(x, other):

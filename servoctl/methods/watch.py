@@ -94,16 +94,13 @@ class Tolerance:
 
     def accept(self, x):
         """Take in states (n_x, N) as part of the motion."""
-        self.sizes = np.fmax(self.sizes, self._from_start(x).max(axis=1))
-
-    def _from_start(self, x):
-        """The magnitudes of states (n_x, N), those of q from the first state on, but for rounding."""
-        self.x0 = np.where(self.levels == 0, x[:, 0], 0.0)[:, None] if self.x0 is None else self.x0
-        return np.fmax(np.abs(x - self.x0), LEAST_RTOL / self.rtol * np.abs(x))
+        self.sizes = self._sizes(x)[:, -1]
 
     def _sizes(self, x):
-        """The largest size of each entry's level so far, of q from the start on, (n_x, N)."""
-        sizes = np.fmin(np.fmax(self._from_start(x), self.sizes[:, None]), np.finfo(float).max)
+        """The largest size of each entry's level so far, (n_x, N): of q its way from the first state, or rounding."""
+        self.x0 = np.where(self.levels == 0, x[:, 0], 0.0)[:, None] if self.x0 is None else self.x0
+        sizes = np.fmax(np.abs(x - self.x0), LEAST_RTOL / self.rtol * np.abs(x))
+        sizes = np.fmin(np.fmax(sizes, self.sizes[:, None]), np.finfo(float).max)
         first = np.searchsorted(self.levels, range(self.levels[-1] + 1))
         return np.maximum.accumulate(np.maximum.reduceat(sizes, first)[self.levels], axis=1)
 

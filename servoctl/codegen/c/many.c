@@ -10,8 +10,7 @@
 #define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
 
 typedef struct {
-    W t, x[NX + 1], p[NP + 1], work[WORK], y[NY + 1], atol, h;
-    W x0[NQ + 1], largest[NX + 1]; /* how far q has moved from x0, and the size of its rates */
+    W t, x[NX + 1], x0[NX + 1], p[NP + 1], work[WORK], y[NY + 1], atol, h, largest[NX + 1]; /* from x0, of rates from 0 */
     W pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
     W ahead[N + 1]; /* gamma^(s) at the end of the step, by its series */
     I steps;
@@ -41,11 +40,8 @@ INLINE W w_rough_exp2(W a)
 INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     W largest = ALL(0.0);
-    int some = 0;
     UNROLLED for (int64_t i = 0; i < n; i++) {
-        if (level && !IS_FREE((level - 1) * N + i)) continue;
-        largest = some ? w_larger_size(w_fabs(v[i]), largest) : w_fabs(v[i]);
-        some = 1;
+        if (!level || IS_FREE((level - 1) * N + i)) largest = w_larger_size(w_fabs(v[i]), largest);
     }
     return largest;
 }
@@ -108,8 +104,8 @@ static int load(Many *m, int64_t lane, Motions *s)
     s->h[lane] = s->steps[lane] = s->sampled[lane] = 0;
     s->atol[lane] = m->atol[from];
     for (int64_t i = 0; i < NX; i++) s->x[i][lane] = m->x0[from * NX + i];
-    for (int64_t i = 0; i < NQ; i++) s->x0[i][lane] = s->x[i][lane];
-    for (int64_t i = 0; i < NX; i++) s->largest[i][lane] = i < NQ ? 0 : fabs(s->x[i][lane]);
+    for (int64_t i = 0; i < NX; i++) s->x0[i][lane] = i < NQ ? s->x[i][lane] : 0;
+    for (int64_t i = 0; i < NX; i++) s->largest[i][lane] = fabs(s->x[i][lane] - s->x0[i][lane]);
     for (int64_t i = 0; i < NP; i++) s->p[i][lane] = m->p[from * NP + i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->pivots[i][lane] = m->pivots[i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->signs[i][lane] = 0;
@@ -238,7 +234,7 @@ void FN(many)(Many *m)
         s.h = h;
         for (int64_t i = 0; i < NX; i++) {
             s.x[i] = x[i];
-            s.largest[i] = w_larger_size(s.largest[i], w_fabs(i < NQ ? x[i] - s.x0[i] : x[i]));
+            s.largest[i] = w_larger_size(s.largest[i], w_fabs(x[i] - s.x0[i]));
         }
         s.t = w_select(ends & (h != 0), ALL(m->t1), s.t + h);
     }

@@ -37,15 +37,12 @@ static inline double length(double scale, const double *c, const double *w, int6
 }
 
 /* The step h at which the last terms of all levels meet the tolerance, with weights w (NX) of the state or NULL. The size
-   of q is how far it has `moved` at most from the start x0, since q itself hangs on the origin. */
-static inline double step_length(const double *x, const double *x0, const double *y, const double *w, double log_rtol,
-                                 double least, double *moved)
+   of q is how far it has `moved` from the start at most, since q itself hangs on the origin. */
+static inline double step_length(const double *x, const double *y, const double *w, double log_rtol, double least,
+                                 double moved)
 {
     const double *c = y + (PLAIN ? 0 : NQ * LAST);
-    double way[NQ + 1];
-    for (int64_t i = 0; i < NQ; i++) way[i] = x[i] - x0[i];
-    widen(moved, largest_size(way, w, NQ, 0));
-    double log_h = length(least + *moved, y, w, NQ, 0, log_rtol);
+    double log_h = length(least + moved, y, w, NQ, 0, log_rtol);
     for (int64_t j = 1; j < TOP; j++) {
         const int64_t at = NQ + (j - 1) * N;
         const double *v = w ? w + at : w;
@@ -53,13 +50,6 @@ static inline double step_length(const double *x, const double *x0, const double
         log_h = of_level < log_h ? of_level : log_h;
     }
     return rough_exp2(log_h);
-}
-
-/* The same, out of the way of motions without weights. */
-static __attribute__((noinline)) double weighted_step(const double *x, const double *x0, const double *y, const double *w,
-                                                      double log_rtol, double least, double *moved)
-{
-    return step_length(x, x0, y, w, log_rtol, least, moved);
 }
 
 /* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients.
@@ -121,9 +111,8 @@ int64_t FN(taylor)(const Steps *s)
             FN(still)(t, x, p, 0, work);
         }
         FN(moving)(t, x, p, y, work);
-        const double *c = y + (PLAIN ? 0 : NQ * LAST), *x0 = s->start + 1, *w = s->weights;
-        const double h = w ? weighted_step(x, x0, y, w, log_rtol, least, &moved)
-                           : step_length(x, x0, y, 0, log_rtol, least, &moved);
+        const double *c = y + (PLAIN ? 0 : NQ * LAST), *w = s->weights;
+        const double h = w ? step_length(x, y, w, log_rtol, least, moved) : step_length(x, y, 0, log_rtol, least, moved);
         if (!(h > 1e-13 * (1 + fabs(t)))) {
             settle(t, x, p);
             return step;
@@ -136,6 +125,7 @@ int64_t FN(taylor)(const Steps *s)
         move(x, y, c, signed_h, x_next);
         t = ends ? t1 : t + signed_h;
         for (int64_t i = 0; i < NX; i++) if (!isfinite(x_next[i])) return step;
+        for (int64_t i = 0; i < NQ; i++) widen(&moved, (w ? w[i] : 1) * fabs(x_next[i] - s->start[1 + i]));
         if (project_every && (step + 1) % project_every == 0) {
             settle(t, x_next, p);
             restore(t, x_next, p);

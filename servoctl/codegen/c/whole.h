@@ -123,9 +123,8 @@ int64_t FN(whole)(const Steps *s, const Whole *w)
     NAME(end[0], end + 1, p, end + 1 + NX);
     for (double *fact = farthest; fact <= drifted; fact++) *fact = 0;
     for (int64_t i = 0; i < N_PIVOTS; i++) least[i] = INFINITY;
-    for (double *row = s->log + 1; row <= end + 1; row += columns) {
-        for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(row[i] - (i < NQ ? s->log[1 + i] : 0)));
-    }
+    for (double *x = s->log + 1; x <= end + 1; x += columns)
+        for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(x[i] - (i < NQ ? s->log[1 + i] : 0)));
     for (int64_t step = 0; step <= steps; step++) {
         const double *row = s->log + step * columns, *pivots = row + 1 + NX + N_C, *first = s->log + 1 + NX + N_C;
         FN(invariants)(row[0], row + 1, p, values);
