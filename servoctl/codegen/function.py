@@ -220,9 +220,10 @@ class Compiled:
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then pivots.
 
         A step is as long as its last term meets the tolerance at every level of the state: `rtol` relative to the
-        level's largest entry, and `atol`, a number, or (n_x,) where each entry of a level is measured in its own. A
-        step ends at each of `ends`, in the direction of motion; between two of them paths have one branch, which the
-        last parameter, an instant, selects. The state is projected after every `project_every`-th step, never for 0.
+        level's largest entry, and `atol`, a number, or (n_x,) where each entry of a level is measured in its own. The
+        size of q is its largest way from x0 so far or, where that is more, what q' moves it in the step. A step ends
+        at each of `ends`, in the direction of motion; between two of them paths have one branch, which the last
+        parameter, an instant, selects. The state is projected after every `project_every`-th step, never for 0.
         Returns t, x and outputs at the starts of the S steps, and t and x at the end of the last one, as
         (S + 1, 1 + n_x + n_y); it lies before the last end if the step length vanishes, or S is `max_steps`.
         """
@@ -241,10 +242,10 @@ class Compiled:
         In `net`, at (M,) parts of each step and at a distance of instants [s], series are compared with the equations,
         not at the end if that is a knot (its third entry). Returns rows of the steps, as `taylor` does; the jets q, γ',
         ..., γ^(s̄) at the samples, by "settled" if there is one; and facts: how far γ^(s̄) of the series is from that of
-        "rates" (n,), the longest step (1,), the largest sizes of the states (n_x,), the least size of each pivot, 0
-        where its sign changes, and the largest one, and (1,) the largest of the "invariants" at the end, relative to
-        its gradient times the state. None if the steps do not reach the end, samples are not finite, or nothing is
-        compiled.
+        "rates" (n,), the longest step (1,), the largest sizes of the states (n_x,), of q from the start, the least size
+        of each pivot, 0 where its sign changes, and the largest one, and (1,) the largest of the "invariants" at the
+        end, relative to its gradient times the state. None if the steps do not reach the end, samples are not finite,
+        or nothing is compiled.
         """
         self._require_loop("taylor")
         self._place(self._library, start[0], start[1], p)

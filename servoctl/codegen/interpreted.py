@@ -203,7 +203,7 @@ class Interpreter:
     def taylor(self, ends, rtol, atol, every, max_steps, weights=None):
         """Rows (t, x, y) of the steps from the start in the workspace; see `Compiled.taylor`."""
         nq, n, top, last, plain = (self._sizes[key] for key in ("nq", "n", "top", "last", "plain"))
-        start, n_x = self.workspace.start.copy(), self._n_x
+        start, n_x, moved = self.workspace.start.copy(), self._n_x, 0.0
         t, x, p, rows, (t1, *later) = start[0], start[1 : 1 + n_x], start[1 + n_x :], [], np.atleast_1d(ends)
         p[-1] = (t + t1) / 2
         free = np.array(self._sizes.get("free", [1] * (n_x - nq)), dtype=bool).reshape(top - 1, n)
@@ -219,8 +219,9 @@ class Interpreter:
             of_q = y[: nq * last].reshape(last, nq)
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
             levels = zip(*(part[nq:].reshape(top - 1, n) for part in (x, w)), free, strict=True)
+            moved = np.abs(w[:nq] * (x[:nq] - start[1 : 1 + nq])).max(initial=moved)
             of_rates = (longest((u * v)[i], (u * c)[:, i], j, rtol, atol) for j, (v, u, i) in enumerate(levels, 1))
-            h = rough_exp2(min(longest(w[:nq] * x[:nq], w[:nq] * of_q, 0, rtol, atol), *of_rates))
+            h = rough_exp2(min(longest(moved, w[:nq] * of_q, 0, rtol, atol), *of_rates))
             if not h > 1e-13 * (1 + abs(t)):
                 x = self._settle(t, x, p)
                 break
@@ -372,15 +373,18 @@ def weighted(atol):
 def longest(level, c, j, rtol, atol):
     """log2 of the step at which the last term of a level j of the state is in tolerance; c (last, n) are coefficients.
 
-    Terms are taken to grow as the fastest of four of them.
+    Terms are taken to grow as the fastest of four of them. For q the level is how far it has moved, and the last term
+    may also be in tolerance of what q' moves it in the step.
     """
     last = len(c)
     k = np.array([last, last - 1, last // 2 + 1, last // 2])
-    k = k[k > j]
+    k = k[k > max(j, 1)]
     falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
-    scale = rough_log2(atol / rtol + np.abs(level).max(initial=0.0))
-    terms = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0)) + rough_log2(falling)
-    return np.min(np.log2(LAST_TERM * rtol) / (last - j) + (scale - terms) / (k - j), initial=np.inf)
+    scale, log_rtol = rough_log2(atol / rtol + np.max(np.abs(level), initial=0.0)), np.log2(LAST_TERM * rtol)
+    rate, sizes = (rough_log2(np.abs(some).max(axis=1, initial=0.0)) for some in (c[:1], c[k - 1]))
+    h = log_rtol / (last - j) + (scale - sizes - rough_log2(falling)) / (k - j)
+    of_way = log_rtol / (last - 1) + (rate - sizes) / (k - 1)
+    return np.min(h if j else np.maximum(h, of_way), initial=np.inf)
 
 
 def _distance(x, other):

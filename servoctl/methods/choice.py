@@ -211,8 +211,10 @@ class Taylor(Method):
         Highest derivative in the samples, 1 to 40: `run["d4theta"]`; default s̄. Values above s̄ also give rates of
         the actuation: `run["dtrolley"]`.
     rtol, atol : float
-        Tolerances of a step. The defaults keep residuals near 1e-9 over tens of seconds. Default atol: 1e-11; a motion
-        that turns out to be so small that this is no small part of it is computed again with a smaller one.
+        Tolerances of a step. `rtol` is relative to the largest coordinate, velocity, ...; coordinates count from the
+        start, so that steps are the same wherever their origin lies. The defaults keep residuals near 1e-9 over tens of
+        seconds. Default atol: 1e-11; a motion that turns out to be so small that this is no small part of it is
+        computed again with a smaller one.
     """
 
     order: int | None = None

@@ -102,7 +102,7 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
     arrays are None without a compiler or beyond `TAYLOR_COMPILED` operations. An end has the outcome (1: finished, 0:
     not reached before Ctrl-C, else to be computed by itself), number of steps, last instant, largest violation of the
     invariants at start and end (relative to their gradients times the state), last state, and largest sizes of the
-    state. `progress` is called with the number of cases begun.
+    state, `from_start`. `progress` is called with the number of cases begun.
     """
     f = series_loop(model, last)
     library = None if f.operations > TAYLOR_COMPILED else _library(f, model)

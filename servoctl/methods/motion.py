@@ -14,6 +14,7 @@ from servoctl.methods.choice import Poles
 from servoctl.methods.edges import Edges, edge
 from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.pieces import DEFAULT, End, Tolerance
+from servoctl.methods.sizes import from_start
 from servoctl.methods.switches import Switches, no_model, sticks
 from servoctl.model.following import instants_of
 from servoctl.model.variants import derived_near
@@ -48,7 +49,7 @@ class Motion:
     start: object = None  # X at t0, if it is not the given one
     room: int = 0  # samples of the whole motion
     drifted: float = np.nan  # largest residual at t1, relative to its gradient times the state; NaN if it is not known
-    largest: float | np.ndarray = 0.0  # magnitudes (n_x,) of X at the ends of steps
+    largest: float | np.ndarray = 0.0  # magnitudes (n_x,) of X, `from_start`, at the ends of steps
     steps: list = field(default_factory=list)  # `Dense`, kept until they fill the memory that they may take
     kept: float = 0.0  # memory of the steps; infinite where it was too much
     _t: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -119,7 +120,7 @@ class Motion:
         return [(model, self._t[a:b], self._jets[:, a:b]) for model, _, a, b in self.pieces]
 
     def reaches(self, x):
-        """Take in the states (n_x, S) at the ends of steps."""
+        """Take in the states (n_x, S) at the ends of steps, `from_start`."""
         self.largest = np.fmax(self.largest, np.abs(x).max(axis=1))
 
     def end_before(self, t, error):
@@ -273,7 +274,7 @@ class Stepping:
     def run(self, t0, x0, t1, t_eval, knots):
         """Integrate from x0 (n_x,) at t0 to t1 [s], with samples at t_eval, in this order; steps end at the knots."""
         with interruptible(self.motion):
-            self.span, self.length = (t0, t1), abs(t1 - t0)
+            self.span, self.length, self.x0 = (t0, t1), abs(t1 - t0), x0
             self._look_out(t0, x0)
             t, x, cuts = t0, x0, breakpoints(self.span, knots)
             at_ends = (c for c in self.span if (np.abs(np.subtract(knots, c)) <= margin_at(c, self.span)).any())
@@ -323,7 +324,7 @@ class Stepping:
     def _inspected(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
         outcome = self._smooth(stretch)
-        self.motion.reaches(stretch.x[:, : outcome.steps + 1])
+        self.motion.reaches(from_start(self.model, stretch.x[:, : outcome.steps + 1], self.x0))
         self.tolerance.accept(stretch.x[:, : outcome.steps + 1])
         return outcome if self.events is None else self._event(stretch, outcome) or outcome
 

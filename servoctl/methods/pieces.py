@@ -49,7 +49,7 @@ class Tolerance:
         self.rtol, atol = max(rtol, LEAST_RTOL), np.maximum(atol, LEAST_ATOL)
         self.levels = state_levels(model)
         self.atol = np.broadcast_to(atol, len(self.levels))[:, None]
-        self.sizes = np.zeros(len(self.levels))
+        self.sizes, self.x0 = np.zeros(len(self.levels)), None
 
     def of(self, slopes, x):
         """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
@@ -57,11 +57,13 @@ class Tolerance:
 
     def accept(self, x):
         """Take in states (n_x, N) as part of the motion."""
-        self.sizes = np.fmax(self.sizes, np.abs(x).max(axis=1))
+        self.sizes = self._sizes(x)[:, -1]
 
     def _sizes(self, x):
-        """The largest size of each entry's level so far, (n_x, N)."""
-        sizes = np.fmin(np.fmax(np.abs(x), self.sizes[:, None]), np.finfo(float).max)
+        """The largest size of each entry's level so far, (n_x, N): of q its way from the first state, or rounding."""
+        self.x0 = np.where(self.levels == 0, x[:, 0], 0.0)[:, None] if self.x0 is None else self.x0
+        sizes = np.fmax(np.abs(x - self.x0), LEAST_RTOL / self.rtol * np.abs(x))
+        sizes = np.fmin(np.fmax(sizes, self.sizes[:, None]), np.finfo(float).max)
         first = np.searchsorted(self.levels, range(self.levels[-1] + 1))
         return np.maximum.accumulate(np.maximum.reduceat(sizes, first)[self.levels], axis=1)
 

@@ -17,6 +17,11 @@ def _levels(n_x, nq, n):
     return read_only(np.append(np.zeros(nq, dtype=int), 1 + np.arange(n_x - nq) // n))
 
 
+def from_start(model, x, x0):
+    """States x (n_x, N), q as its way from the start x0 (n_x,), whose size does not hang on where the origin lies."""
+    return x - np.where(state_levels(model) == 0, x0, 0.0)[:, None]
+
+
 def motion_sizes(model, t, x):
     """Sizes (n_x,) of the entries of X along a motion, in the metric of the inertia, with which no unit matters.
 

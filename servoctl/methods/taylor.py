@@ -25,6 +25,7 @@ from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
 from servoctl.methods.pieces import RESOLUTION, End, Tolerance, net
+from servoctl.methods.sizes import from_start
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
 from servoctl.reduction.cascade import Running
@@ -110,15 +111,7 @@ class _Rows:
         if reduced:
             self.rows, self.leading, first = reduced
             self.stages = [first, self.solved[1]]
-        self.groups = [self._grouped(rows) for rows, _, _ in self.stages]
-
-    def _grouped(self, rows):
-        """Rows by order."""
-        groups = []
-        for order in sorted({self.rows[a].order for a in rows}):
-            members = [a for a in rows if self.rows[a].order == order]
-            groups.append(_Group(self.motion, order, members, [self.rows[a].expression for a in members]))
-        return groups
+        self.groups = [_groups(self.motion, self.rows, rows) for rows, _, _ in self.stages]
 
     def advance(self, k):
         """γ_[k]: below s̄ from the state and the rows that determine a part of it, from s̄ on from all rows."""
@@ -126,10 +119,8 @@ class _Rows:
         if k:
             self.motion.guess(k, [j for _, columns, _ in stages for j in columns])
         for groups, (rows, columns, order) in zip(self.groups, stages, strict=True):
-            groups, right = [group for group in groups if group.order <= k], {}
-            for group in groups:
-                scale = -factorial(k - group.order) / factorial(k)
-                right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(), strict=True)}
+            groups = [group for group in groups if group.order <= k]
+            right = _right(groups, k, rows)
             if len(rows):
                 self._settle(k, columns, self._solution(rows, columns, order, right))
                 for group in groups:
@@ -148,7 +139,6 @@ class _Rows:
 
     def _solution(self, rows, columns, order, right):
         matrix = self.leading[list(rows), list(columns)]
-        right = ca.vertcat(*(right[a] for a in rows))
         return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
 
     def by_rows(self, outputs):
@@ -208,12 +198,15 @@ def _with_multipliers(equations, last):
     r, motion = equations.r, _Reacting(equations)
     for k in range(1, equations.top):
         motion.guess(k, ())
-    groups, forces = _groups(motion, monitored_rows(r)), (r.balance - r.realisation.B @ motion.multipliers).elements()
-    balance = _Group(motion, 2, range(len(forces)), forces)
+    rows, forces = monitored_rows(r), (r.balance - r.realisation.B @ motion.multipliers).elements()
+    groups, balance = _groups(motion, rows, range(len(rows))), _Group(motion, 2, range(len(forces)), forces)
+    for group in groups:
+        for _ in range(group.order, motion.top):
+            group.advance()
     for k in range(2, last + 1):
         motion.guess(k, ())
         motion.mu.append([0.0] * len(motion.indices))
-        gamma, mu, _ = r.realisation.solve(_right([balance], k), _right(groups, k))
+        gamma, mu, _ = r.realisation.solve(_right([balance], k, balance.members), _right(groups, k, range(len(rows))))
         motion.mu[-1] = (mu * float(k * (k - 1))).elements()
         motion.settle(k, [0.0 if x.is_zero() else x for x in gamma.elements()])
         for group in (*groups, balance):
@@ -221,24 +214,21 @@ def _with_multipliers(equations, last):
     return motion
 
 
-def _groups(motion, rows):
-    """Rows by order, with their coefficients up to the motion's known ones."""
-    groups = []
-    for order in sorted({row.order for row in rows}):
-        members = [a for a, row in enumerate(rows) if row.order == order]
-        groups.append(_Group(motion, order, members, [rows[a].expression for a in members]))
-        for _ in range(order, motion.top):
-            groups[-1].advance()
-    return groups
+def _groups(motion, rows, places):
+    """The rows at some places, by order."""
+    members = {}
+    for a in places:
+        members.setdefault(rows[a].order, []).append(a)
+    return [_Group(motion, order, some, [rows[a].expression for a in some]) for order, some in sorted(members.items())]
 
 
-def _right(groups, k):
-    """-((k - o)!/k!) ψ_[k-o] of the rows of groups, with γ_[k] = 0."""
+def _right(groups, k, places):
+    """-((k - o)!/k!) ψ_[k-o] of the rows at some places, all in groups, with γ_[k] = 0."""
     right = {}
     for group in groups:
         scale = -factorial(k - group.order) / factorial(k)
         right |= {a: ca.SX(c) * scale for a, c in zip(group.members, group.advance(), strict=True)}
-    return ca.vertcat(*(right[a] for a in sorted(right)))
+    return ca.vertcat(*(right[a] for a in places))
 
 
 def _coefficients(equations, coordinates, gamma, last, finished=list):
@@ -505,8 +495,8 @@ class TaylorSteps(Stepping):
         off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
         rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
         h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
-        farthest, states = off.max(axis=1), np.abs(log.states).max(axis=1)
-        for level, (entries, largest) in self._far_off(farthest, h.max(), states).items():
+        farthest, states = off.max(axis=1), np.abs(from_start(self.model, log.states, self.x0)).max(axis=1)
+        for level, (entries, largest) in self._far_off(farthest, h.max(), np.fmax(states, self.motion.largest)).items():
             part, missed, highest = perm(last, level) / perm(last, self.top - 1), off[entries], top[entries]
             if weights is not None and (level or self.plain):
                 w = weights[self._level(level), None][entries]
@@ -520,7 +510,8 @@ class TaylorSteps(Stepping):
     def _far_off(self, farthest, longest, states):
         """Levels at which series may miss the equations: entries of γ, and the largest state of the level.
 
-        `farthest` (n,) is how far γ^(s̄) is off at most, `longest` the longest step, `states` (n_x,) the largest states.
+        `farthest` (n,) is how far γ^(s̄) is off at most, `longest` the longest step, `states` (n_x,) the
+        largest states, `from_start`.
         """
         rtol, (atol, weights), last, result = self.tolerances[0], weighted(self.tolerances[1]), self.f.sizes["last"], {}
         for level, entries in _integrated_levels(self.f.sizes.get("free", (1,) * (self.n_x - self.nq)), self.n).items():

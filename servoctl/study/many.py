@@ -355,11 +355,11 @@ class _Many:
         return affirmed_each(self.model, p.T.copy())
 
     def _tolerances_fit(self, span, cases, largest, method):
-        """Whether motions with magnitudes (n_x, N) need no tolerances of their own, as `simulate` decides it."""
+        """Whether motions with magnitudes (n_x, N), `from_start`, need no tolerances of their own, as in `simulate`."""
         default, levels = method.atol is None, state_levels(self.model)
         fit, doubtful = np.ones(largest.shape[1], bool), unlike(levels, largest)
         if default:
-            fit = largest.max(axis=0) <= LARGE
+            fit = np.maximum(largest, np.abs(cases[0].T)).max(axis=0) <= LARGE
             doubtful |= (largest < ATOL / method.rtol).any(axis=0)
         some = np.flatnonzero(doubtful)
         if len(some):

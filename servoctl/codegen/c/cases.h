@@ -7,7 +7,7 @@
 /* Inputs are a row for each case: x0, p, absolute tolerance; the indices of the cases to compute; and for all of them the
    pivots' sizes, the instants of samples, and those at which steps end. A thread takes at most so many steps, and leaves
    the cases that it has not finished. Results are a row for each case: the outcome, the number of steps, the last
-   instant, by how much the invariants are violated, the last state, the largest sizes of the state; and its samples. */
+   instant, by how much the invariants are violated, the last state, its largest sizes, of q from x0; and its samples. */
 #define RESULTS 4 /* before the state */
 
 typedef struct {

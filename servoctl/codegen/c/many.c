@@ -10,7 +10,7 @@
 #define COEFFICIENTS ((PLAIN ? 0 : NQ * LAST) + N * LAST) /* outputs before the pivots */
 
 typedef struct {
-    W t, x[NX + 1], p[NP + 1], work[WORK], y[NY + 1], atol, h, largest[NX + 1];
+    W t, x[NX + 1], x0[NX + 1], p[NP + 1], work[WORK], y[NY + 1], atol, h, largest[NX + 1]; /* from x0, of rates from 0 */
     W pivots[NY - COEFFICIENTS + 1], signs[NY - COEFFICIENTS + 1];
     W ahead[N + 1]; /* gamma^(s) at the end of the step, by its series */
     I steps;
@@ -40,27 +40,26 @@ INLINE W w_rough_exp2(W a)
 INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     W largest = ALL(0.0);
-    int some = 0;
     UNROLLED for (int64_t i = 0; i < n; i++) {
-        if (level && !IS_FREE((level - 1) * N + i)) continue;
-        largest = some ? w_larger_size(w_fabs(v[i]), largest) : w_fabs(v[i]);
-        some = 1;
+        if (!level || IS_FREE((level - 1) * N + i)) largest = w_larger_size(w_fabs(v[i]), largest);
     }
     return largest;
 }
 
 /* `length` of taylor.c in lanes. */
-INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_rtol, W least)
+INLINE W w_length(W scale, const W *c, int64_t n, int64_t level, double log_rtol)
 {
-    const W scale = w_rough_log2(least + w_largest(x, n, level));
+    const W log_scale = w_rough_log2(scale), rate = level ? scale : w_rough_log2(w_largest(c, n, 0));
     W shortest = ALL(INFINITY);
     UNROLLED for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
-        if (k <= level || k == 0) continue;
+        if (k <= level || k < 2) continue;
         const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, level));
         const double part = 1.0 / (double)(k - level);
         const double all = log_rtol * (1.0 / (double)(LAST - level)) - rough_log2(falling(k, level)) * part;
-        shortest = w_lesser((scale - size) * part + all, shortest);
+        W h = (log_scale - size) * part + all;
+        if (!level) h = w_fmax((rate - size) * (1.0 / (double)(k - 1)) + log_rtol * (1.0 / (double)(LAST - 1)), h);
+        shortest = w_lesser(h, shortest);
     }
     return shortest;
 }
@@ -105,7 +104,8 @@ static int load(Many *m, int64_t lane, Motions *s)
     s->h[lane] = s->steps[lane] = s->sampled[lane] = 0;
     s->atol[lane] = m->atol[from];
     for (int64_t i = 0; i < NX; i++) s->x[i][lane] = m->x0[from * NX + i];
-    for (int64_t i = 0; i < NX; i++) s->largest[i][lane] = fabs(m->x0[from * NX + i]);
+    for (int64_t i = 0; i < NX; i++) s->x0[i][lane] = i < NQ ? s->x[i][lane] : 0;
+    for (int64_t i = 0; i < NX; i++) s->largest[i][lane] = fabs(s->x[i][lane] - s->x0[i][lane]);
     for (int64_t i = 0; i < NP; i++) s->p[i][lane] = m->p[from * NP + i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->pivots[i][lane] = m->pivots[i];
     for (int64_t i = 0; i < NY - COEFFICIENTS; i++) s->signs[i][lane] = 0;
@@ -166,7 +166,7 @@ INLINE I off(const Motions *s, const W *c, double rtol)
 {
     I wrong = w_bits(ALL(0.0));
     UNROLLED for (int64_t j = 0; j < TOP; j++) {
-        W error = ALL(0.0), size = j ? w_largest(s->x + NQ + (j - 1) * N, N, 0) : w_largest(s->x, NQ, 0);
+        W error = ALL(0.0), size = j ? w_largest(s->x + NQ + (j - 1) * N, N, 0) : w_largest(s->largest, NQ, 0);
         W part = ALL(falling(LAST, j) / falling(LAST, TOP - 1));
         for (int64_t m = j; m < TOP; m++) part *= s->h;
         UNROLLED for (int64_t i = 0; i < N; i++) {
@@ -192,9 +192,9 @@ void FN(many)(Many *m)
         if (stopped(m) || steps == m->most) break;
         expansion_moving(s.t, s.x, s.p, s.y, s.work);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
-        W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
+        W log_h = w_length(least + w_largest(s.largest, NQ, 0), s.y, NQ, 0, log_rtol);
         for (int64_t j = 1; j < TOP; j++) {
-            const W of_level = w_length(s.x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
+            const W of_level = w_length(least + w_largest(s.x + NQ + (j - 1) * N, N, j), c, N, j, log_rtol);
             log_h = w_lesser(of_level, log_h);
         }
         for (int64_t i = 0; i < N * (TOP - 1); i++) {
@@ -234,7 +234,7 @@ void FN(many)(Many *m)
         s.h = h;
         for (int64_t i = 0; i < NX; i++) {
             s.x[i] = x[i];
-            s.largest[i] = w_larger_size(s.largest[i], w_fabs(x[i]));
+            s.largest[i] = w_larger_size(s.largest[i], w_fabs(x[i] - s.x0[i]));
         }
         s.t = w_select(ends & (h != 0), ALL(m->t1), s.t + h);
     }

@@ -17,42 +17,39 @@ static inline double largest_size(const double *v, const double *w, int64_t n, i
     return s_value(largest);
 }
 
-/* log2 of the step at which the last term is 2^log_rtol of a level x of the state, the terms taken to grow as the
-   fastest of some do: single coefficients may vanish. */
-static inline double length(const double *x, const double *c, const double *w, int64_t n, int64_t level, double log_rtol,
-                            double least)
+/* log2 of the step at which the last term is 2^log_rtol of a level of the state, which is `scale` large, or for q of what
+   q' moves it in the step; the terms are taken to grow as the fastest of some do: single coefficients may vanish. */
+static inline double length(double scale, const double *c, const double *w, int64_t n, int64_t level, double log_rtol)
 {
-    const double scale = rough_log2(least + largest_size(x, w, n, level));
+    const double log_scale = rough_log2(scale), rate = rough_log2(largest_size(c, w, n, level));
     double shortest = INFINITY;
     for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
-        if (k <= level || k == 0) continue;
+        if (k <= level || k < 2) continue;
         const double size = rough_log2(largest_size(c + (k - 1) * n, w, n, level));
-        const double growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
+        const double growth = (log_scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
         const double h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
-        shortest = h < shortest ? h : shortest;
+        const double of_way = log_rtol * (1.0 / (double)(LAST - 1)) + (rate - size) * (1.0 / (double)(k - 1));
+        const double longer = level == 0 && of_way > h ? of_way : h;
+        shortest = longer < shortest ? longer : shortest;
     }
     return shortest;
 }
 
-/* The step h at which the last terms of all levels meet the tolerance, with weights w (NX) of the state or NULL. */
-static inline double step_length(const double *x, const double *y, const double *w, double log_rtol, double least)
+/* The step h at which the last terms of all levels meet the tolerance, with weights w (NX) of the state or NULL. The size
+   of q is how far it has `moved` from the start at most, since q itself hangs on the origin. */
+static inline double step_length(const double *x, const double *y, const double *w, double log_rtol, double least,
+                                 double moved)
 {
     const double *c = y + (PLAIN ? 0 : NQ * LAST);
-    double log_h = length(x, y, w, NQ, 0, log_rtol, least);
+    double log_h = length(least + moved, y, w, NQ, 0, log_rtol);
     for (int64_t j = 1; j < TOP; j++) {
         const int64_t at = NQ + (j - 1) * N;
-        const double of_level = length(x + at, c, w ? w + at : w, N, j, log_rtol, least);
+        const double *v = w ? w + at : w;
+        const double of_level = length(least + largest_size(x + at, v, N, j), c, v, N, j, log_rtol);
         log_h = of_level < log_h ? of_level : log_h;
     }
     return rough_exp2(log_h);
-}
-
-/* The same, out of the way of motions without weights. */
-static __attribute__((noinline)) double weighted_step(const double *x, const double *y, const double *w, double log_rtol,
-                                                      double least)
-{
-    return step_length(x, y, w, log_rtol, least);
 }
 
 /* The state a time h after the expansion: x_j = sum over k of k!/(k - j)! c_[k] h^(k - j); y holds the coefficients.
@@ -97,7 +94,7 @@ int64_t FN(taylor)(const Steps *s)
     const double log_rtol = log2(LAST_TERM * s->rtol), least = s->atol / s->rtol, *end = s->ends;
     const double *last = end + (int64_t)s->count - 1;
     const int64_t max_steps = (int64_t)s->max_steps, project_every = (int64_t)s->project_every;
-    double t = s->start[0], t1 = *end, *log = s->log, p[NP], work[WORK];
+    double t = s->start[0], t1 = *end, moved = 0, *log = s->log, p[NP], work[WORK];
     for (int64_t i = 0; i < NX; i++) log[1 + i] = s->start[1 + i];
     on_branch(s->start + 1 + NX, (t + t1) / 2, p);
     FN(still)(t, log + 1, p, 0, work);
@@ -115,7 +112,7 @@ int64_t FN(taylor)(const Steps *s)
         }
         FN(moving)(t, x, p, y, work);
         const double *c = y + (PLAIN ? 0 : NQ * LAST), *w = s->weights;
-        const double h = w ? weighted_step(x, y, w, log_rtol, least) : step_length(x, y, 0, log_rtol, least);
+        const double h = w ? step_length(x, y, w, log_rtol, least, moved) : step_length(x, y, 0, log_rtol, least, moved);
         if (!(h > 1e-13 * (1 + fabs(t)))) {
             settle(t, x, p);
             return step;
@@ -128,6 +125,7 @@ int64_t FN(taylor)(const Steps *s)
         move(x, y, c, signed_h, x_next);
         t = ends ? t1 : t + signed_h;
         for (int64_t i = 0; i < NX; i++) if (!isfinite(x_next[i])) return step;
+        for (int64_t i = 0; i < NQ; i++) widen(&moved, (w ? w[i] : 1) * fabs(x_next[i] - s->start[1 + i]));
         if (project_every && (step + 1) % project_every == 0) {
             settle(t, x_next, p);
             restore(t, x_next, p);

@@ -90,7 +90,7 @@ static void compare(const double *row, double end, int knot, int by_samples, con
    `facts` are, in this order:
      N           how far gamma^(s) of the series is at most from that of the equations
      1           the longest step
-     NX          the largest size of each state at the ends of all steps
+     NX          how far each of q has moved from the start at most at the ends of steps, and the largest size of each rate
      N_PIVOTS    the least size of each pivot, 0 where its sign changes
      N_PIVOTS    its largest size
      1           the largest invariant at the end, relative to its gradient times the state */
@@ -109,7 +109,7 @@ int64_t FN(whole)(const Steps *s, const Whole *w)
     for (int64_t i = 0; i < N_PIVOTS; i++) least[i] = INFINITY;
     for (int64_t step = 0; step <= steps; step++) {
         const double *row = s->log + step * columns, *pivots = row + 1 + NX + N_C, *first = s->log + 1 + NX + N_C;
-        for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(row[1 + i]));
+        for (int64_t i = 0; i < NX; i++) widen(states + i, fabs(row[1 + i] - (i < NQ ? s->log[1 + i] : 0)));
         for (int64_t i = 0; i < N_PIVOTS; i++) {
             const double size = pivots[i] * first[i] > 0 ? fabs(pivots[i]) : 0;
             least[i] = size < least[i] ? size : least[i];
