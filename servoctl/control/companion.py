@@ -15,11 +15,17 @@ from servoctl.control.residuals import as_read, in_symbols_of, paths_along, prog
 from servoctl.control.sampling import spectral_radii
 from servoctl.errors import SpecificationError
 from servoctl.model.jets import extended
+from servoctl.model.model import derive
+from servoctl.simulation import simulated
 from servoctl.spec.integrals import integrals
+from servoctl.spec.mechanism import Mechanism
+from servoctl.spec.paths.scipy_paths import as_path
+from servoctl.spec.program import Program
 from servoctl.spec.references import Jets
 from servoctl.values import frozen
 
 SUFFIX = " along the plan"  # of the reference that F follows
+NODES = 257  # of the path of F along a plan: within pieces of a 256th of it the path is as smooth as the plan
 FASTEST, HALVINGS = 4.0, 50  # p h at which every sampled chain is unstable; bisections of its bound
 
 
@@ -49,6 +55,33 @@ class Companion:
                     name=name,
                     t=float(t[lost][0]),
                 )
+
+    def run_of(self, plan, order):
+        """The motion of a plan under the program of these rows, whose internal dynamics have no error of any F.
+
+        F along the plan is a path of class `order`, through its values at instants of the plan.
+        """
+        from scipy.interpolate import BPoly
+
+        model, t = plan.model, np.unique(np.append(np.linspace(*plan.span, NODES), plan.knots))
+        reduction, names = model.reduction, {name: f"{name}{SUFFIX}" for name in self.of_plan}
+        paths = {
+            names[name]: as_path(BPoly.from_derivatives(t, along.jets(t, order)[:, 0].T), smoothness=order)
+            for name, along in self.of_plan.items()
+        }
+        q, followed = reduction.mechanism.q.beside(**paths)
+        rows = reduction.program.residuals | as_read(model)[0]
+        rows |= {name: rows[name] - followed[names[name]] for name in names}
+        mechanism = object.__new__(Mechanism)
+        vars(mechanism).update(vars(reduction.mechanism) | {"q": q})
+        program = Program(rows, reduction.program.by, jumps=True)
+        program.weights, program.toward, program.metric = (
+            getattr(reduction.program, part) for part in ("weights", "toward", "metric")
+        )
+        with_numbers = dict(zip(mechanism.parameters.names, model.parameters, strict=False))
+        found = derive(mechanism, program).with_parameters(**with_numbers)
+        own = {name: path for name, path in model.paths.items() if name in found.paths}
+        return simulated(found.with_references(**own), plan.state(plan.span[0]), plan.span)
 
 
 def companion(plan, plant):

@@ -40,14 +40,12 @@ MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until
 TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
 
 
-def linearise(plan, plant):
+def linearise(plan, plant, rows):
     """The extension that a plant needs for exact linearisation of a program; ranks are decided about the plan's states.
 
-    Refuses residuals of an order above 2 without F, a plant of another mechanism, and residuals that depend on no
-    input, or not in proportion.
+    `rows` is the program's `companion`. Refuses residuals that depend on no input, or not in proportion.
     """
-    _require_invertible(plan.model.reduction, plant)
-    rows, along = companion(plan, plant), np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS)
+    along = np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS)
     rows.require_finite(along)
     extension = _Extension(plant, rows, _points(plan, plant), (along, _plant_states(plan, plant, along)))
     reduction = plan.model.reduction
@@ -121,9 +119,9 @@ class _Extension:
         self.turns = False  # whether the rows that see some inputs change along the plan
         jets = ca.vertcat(*q.gamma(2))
         self.levels = [[ca.substitute(ca.SX(row), jets, acceleration)] for row in self.rows.values()]
+        self._require_affine()
         for level in self.levels:
             self._differentiate(level)
-        self._require_affine()
         self.relative_degree = self.orders
 
     @property
@@ -133,14 +131,21 @@ class _Extension:
 
     @property
     def needed(self):
-        """The least numbers of poles by residual: its relative degree, or the k of a row ψ = D^k F, at least one."""
-        return {name: max(self.powers[name], r, 1) for name, r in self.orders.items()}
+        """The least numbers of poles by residual: its relative degree, or the k of a row ψ = D^k F, at least one.
+
+        Behind integrators or lags an F with accelerations is known by the model alone; one pole more measures it.
+        """
+        found = {}
+        for name, r in self.orders.items():
+            hidden = r > 0 and self.powers[name] > 0 and self.q.order(self.rows[name]) > 1
+            found[name] = max(self.powers[name], r + hidden, 1)
+        return found
 
     def _require_affine(self):
         """Refuse rows whose accelerations do not enter in proportion."""
-        for name, level in zip(self.names, self.levels, strict=True):
-            bent = ca.jacobian(ca.jacobian(level[-1], self.v), self.v).nonzeros()
-            if len(level) == 1 and bent and not vanish(spread(bent)).all():
+        for name, (first, *_) in zip(self.names, self.levels, strict=True):
+            bent = ca.jacobian(ca.vec(ca.jacobian(first, self.v)), self.v).nonzeros()
+            if bent and not vanish(spread(bent)).all():
                 raise SpecificationError(
                     f"Accelerations do not enter {name!r} in proportion.",
                     "What is fed back by accelerations is solved for the inputs, once and for all.",
@@ -432,8 +437,13 @@ def computed(
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
-    _require_stable(plan)
-    linear = linearise(plan, plant)
+    _require_invertible(plan.model.reduction, plant)
+    rows = companion(plan, plant)
+    if not rows.of_plan:
+        _require_stable(plan)
+    linear = linearise(plan, plant, rows)
+    if rows.of_plan:
+        _require_stable(rows.run_of(plan, max(linear.orders.values()) + 1))
     _require_smooth(plan, linear)
     orders, degrees = linear.needed, linear.orders
     poles = _poles(poles, orders)
@@ -530,7 +540,7 @@ def _poles(poles, orders):
         if values.shape not in ((order,), (order + 1,)) or not np.isfinite(values).all() or not _paired(values):
             raise SpecificationError(
                 f"The poles of {name!r} are {poles.get(name)!r}.",
-                f"Its error dynamics have {order} poles, or one more, complex ones in conjugate pairs.",
+                f"Its error dynamics have order {order} and as many poles, or one more; complex ones in pairs.",
                 do=f"Pass {order}, as {[-4.0] * order}.",
                 name=name,
                 order=order,

@@ -90,7 +90,7 @@ class Program(Packed):
 
     def _facts(self):
         """Names, choices, symbols' names and expressions as text."""
-        parts = (self.with_turns, self.weights, self.toward, self.stated)
+        parts = (self.with_turns, self.weights, self.toward, self.integrals, self.stated)
         expressions = [ca.SX(value) for part in parts for value in part.values()]
         symbols = ca.symvar(ca.vertcat(*expressions))
         text = ca.Function("program", symbols, expressions).serialize()
