@@ -8,6 +8,8 @@ extension, it has no error that could be fed back. With e = F - F_plan it is ψ 
 where r is F's relative degree and negative powers of D are sums of e over the samples.
 """
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 
@@ -16,7 +18,6 @@ from servoctl.control.sampling import spectral_radii
 from servoctl.errors import SpecificationError
 from servoctl.model.jets import extended
 from servoctl.model.model import derive
-from servoctl.simulation import simulated
 from servoctl.spec.integrals import integrals
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.paths.scipy_paths import as_path
@@ -26,6 +27,7 @@ from servoctl.values import frozen
 
 SUFFIX = " along the plan"  # of the reference that F follows
 NODES = 257  # of the path of F along a plan: within pieces of a 256th of it the path is as smooth as the plan
+SAMPLES = 1001  # of the motion under the companion, as many as a plan has by default
 FASTEST, HALVINGS = 4.0, 50  # p h at which every sampled chain is unstable; bisections of its bound
 
 
@@ -80,8 +82,16 @@ class Companion:
         )
         with_numbers = dict(zip(mechanism.parameters.names, model.parameters, strict=False))
         found = derive(mechanism, program).with_parameters(**with_numbers)
-        own = {name: path for name, path in model.paths.items() if name in found.paths}
-        return simulated(found.with_references(**own), plan.state(plan.span[0]), plan.span)
+        found = found.with_references(**{name: path for name, path in model.paths.items() if name in found.paths})
+        return replace(
+            plan.sampled(np.linspace(*plan.span, SAMPLES)),
+            model=found,
+            jets=plan.at(np.linspace(*plan.span, SAMPLES))[: len(found.jet_names)],
+            jet_names=found.jet_names,
+            variants=(),
+            steps=(),
+            start=None,
+        )
 
 
 def companion(plan, plant):
