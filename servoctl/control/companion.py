@@ -16,6 +16,7 @@ import numpy as np
 from servoctl.control.residuals import as_read, in_symbols_of, paths_along, program_residuals
 from servoctl.control.sampling import spectral_radii
 from servoctl.errors import SpecificationError
+from servoctl.methods.stability import FASTEST, HALVINGS
 from servoctl.model.jets import extended
 from servoctl.model.model import derive
 from servoctl.spec.integrals import integrals
@@ -27,8 +28,6 @@ from servoctl.values import frozen
 
 SUFFIX = " along the plan"  # of the reference that F follows
 NODES = 257  # of the path of F along a plan: within pieces of a 256th of it the path is as smooth as the plan
-SAMPLES = 1001  # of the motion under the companion, as many as a plan has by default
-FASTEST, HALVINGS = 4.0, 50  # p h at which every sampled chain is unstable; bisections of its bound
 
 
 @frozen(eq=False)
@@ -84,9 +83,9 @@ class Companion:
         found = derive(mechanism, program).with_parameters(**with_numbers)
         found = found.with_references(**{name: path for name, path in model.paths.items() if name in found.paths})
         return replace(
-            plan.sampled(np.linspace(*plan.span, SAMPLES)),
+            plan.sampled(np.linspace(*plan.span, 4 * NODES)),
             model=found,
-            jets=plan.at(np.linspace(*plan.span, SAMPLES))[: len(found.jet_names)],
+            jets=plan.at(np.linspace(*plan.span, 4 * NODES))[: len(found.jet_names)],
             jet_names=found.jet_names,
             variants=(),
             steps=(),

@@ -28,7 +28,6 @@ from servoctl.reduction.realisation import desired_actuation, desired_balance, r
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_rows
 from servoctl.reduction.scales import usual
 from servoctl.reduction.triangular import completed
-from servoctl.spec.integrals import require_integrals
 from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
@@ -310,7 +309,10 @@ def require_parts(mechanism, program, guess):
         named(name, known, "coordinate or derivative")
         finite(name, value)
     distinct("residual", (*program.residuals, *mechanism.constraints), mechanism.signals)  # refuses ambiguous names
-    require_integrals(q, program)
+    if program.stated:
+        from servoctl.spec.integrals import require_integrals
+
+        require_integrals(q, program)
     full = [by_name(values, mechanism.actuators, "actuator", f"The {what}s") for what, values in chosen.items()]
     return program.again(program.with_turns, *full) if full != [*chosen.values()] else program
 

@@ -6,7 +6,6 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread, vanish
 
-HIGHEST = 2  # order of F: a plant's states and inputs determine no higher one
 SEED = 310  # of the jets at which an error shows by how much a stated F is wrong
 
 
@@ -14,8 +13,8 @@ def integrals(q, program):
     """F by row: those that are stated, and for rows of an order above 2 those that `q.dt` wrote."""
     found = {}
     for name, residual in program.residuals.items():
-        F = program.stated.get(name) if q.order(residual) <= HIGHEST else (program.integrals | program.stated).get(name)
-        if F is not None and 0 <= q.order(F) <= min(HIGHEST, q.order(residual) - 1):
+        F = program.stated.get(name) if q.order(residual) <= 2 else (program.integrals | program.stated).get(name)
+        if F is not None and 0 <= q.order(F) <= min(2, q.order(residual) - 1):
             slopes = [slope for _, slope in _left(q, residual, F)]
             if not slopes or vanish(spread(slopes)).all():
                 found[name] = F
@@ -38,10 +37,10 @@ def require_integrals(q, program):
         if name in valid:
             continue
         residual, order = program.residuals[name], q.order(F)
-        if not 0 <= order <= min(HIGHEST, q.order(residual) - 1):
+        if not 0 <= order <= min(2, q.order(residual) - 1):
             raise SpecificationError(
                 f"The integral of {name!r} has order {order}, the residual {q.order(residual)}.",
-                f"F depends on the coordinates, has an order up to {HIGHEST} and one below the residual's.",
+                "F depends on the coordinates, has an order up to 2 and one below the residual's.",
                 do=f"Leave it out, or write the residual as q.dt(F, k) and state integrals={{{name!r}: F}}.",
                 name=name,
                 order=order,
