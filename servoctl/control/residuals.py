@@ -9,14 +9,17 @@ from servoctl.checks import named, rows_read
 from servoctl.codegen.function import compiled
 from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError, unknown
+from servoctl.spec.integrals import integrals
 from servoctl.spec.references import Jets, function_of, orders_in
 
 
 class Residuals:
     """Residuals of a model's program at the states and parameters of a plant.
 
-    `names` selects some, and may name outputs of the mechanism and states: their residual is the deviation from the
-    plan. `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations.
+    A residual of order 3 or more, which is the k-th derivative of F and a function of time, is read by F. `names`
+    selects some, and may name outputs of the mechanism and states: their residual, as that of F, is the deviation from
+    the plan. `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations, more with further
+    jets. `rows` are residuals by name in place of the program's.
 
     Attributes
     ----------
@@ -33,16 +36,21 @@ class Residuals:
         The jets of references, which `expression` takes as numbers: laws have them in their schedule.
     planned : tuple of str
         Names of the residuals that are deviations from the plan.
+    integrated : dict of str to int
+        k by name of the residuals that are read by F.
     measures : tuple of str
         The states on which the residuals depend.
     """
 
-    def __init__(self, model, plant, names=None, order=1):
-        mechanism, residuals = model.reduction.mechanism, program_residuals(model)
+    def __init__(self, model, plant, names=None, order=1, rows=None):
+        mechanism = model.reduction.mechanism
+        residuals, integrated = as_read(model) if rows is None else (rows, {})
         q, planned, along = mechanism.q, _planned(mechanism), {}
         if names is not None:  # which are signals, or else rows
-            along = {name: ca.SX.sym(f"plan {name}") for name in planned if name in names}
-            rows = {name: residuals[row] for name, row in rows_read(residuals, mechanism.signals).items()}
+            read = rows_read(residuals, mechanism.signals)
+            integrated = {name: integrated[row] for name, row in read.items() if row in integrated}
+            along = {name: ca.SX.sym(f"plan {name}") for name in (*planned, *integrated) if name in names}
+            rows = {name: residuals[row] for name, row in read.items()}
             valid = {name: q.order(e) for name, e in (rows | planned).items()}
             residuals = {name: (rows | planned)[name] - along.get(name, 0) for name in valid if name in names}
         orders = {name: q.order(e) for name, e in residuals.items()}
@@ -70,6 +78,9 @@ class Residuals:
         self.symbols = [*(parameters[i] for i in self.places), *along.values(), *self.jets.symbols.elements()]
         self.parameters = np.append(plant.parameters[list(self.places)], np.zeros(len(along) + len(self.jets)))
         self.planned = tuple(along)
+        self.integrated = {name: k for name, k in integrated.items() if name in self.names}
+        self._names_of_state, self._values = plant.state_names, plant.parameters
+        self._own = plant.mechanism.parameters.names
         states = zip(plant.state_names, self._state.elements(), strict=True)
         self._measured = {name: s for name, s in states if ca.depends_on(self.expressions, s)}
         self.measures = tuple(self._measured)
@@ -84,7 +95,7 @@ class Residuals:
     def _function(self, name, outputs):
         """A compiled function of (t, states, p), with accelerations below the states for order 2."""
         if name not in self._built:
-            x = ca.vertcat(self._state, *(self._q.gamma(2) if self._order > 1 else ()))
+            x = ca.vertcat(self._state, *(s for k in range(2, self._order + 1) for s in self._q.gamma(k)))
             y, p = ca.densify(ca.cse(ca.vertcat(*outputs()))), self.symbols[: len(self.symbols) - len(self.jets)]
             f = function_of(self._q, self._names, name, x, ca.vertcat(ca.SX(0, 1), *p), y)
             self._built[name] = compiled(f, name)
@@ -103,24 +114,34 @@ class Residuals:
         self._followed = Followed([self.paths[name].held() for name in self._names])
         return np.append(self._followed.address, numbers)
 
-    def levels(self, t, x):
+    def levels(self, t, x, p=None):
         """Residuals, and the derivative of those of order 0: (2, N) and (1, N) arrays by name.
 
-        `x` (n_x, N) are states of the plant at t (N,); for order 2 with accelerations below the states.
+        `x` (n_x, N) are states of the plant at t (N,); for order 2 and more with the further jets below the states.
         """
+        counts = [1 if n in self.integrated else max(2 - k, 1) for n, k in zip(self.names, self.orders, strict=True)]
 
         def outputs():
-            items = self.expressions.elements()
-            return [
-                level[0]
-                for e, order in zip(items, self.orders, strict=True)
-                for level in self._q.derivatives([e], max(1 - order, 0))
-            ]
+            items = zip(self.expressions.elements(), counts, strict=True)
+            return [level[0] for e, count in items for level in self._q.derivatives([e], count - 1)]
 
-        values = self._function("residual_levels", outputs).grid(t, x, self._p)
-        counts = [max(2 - order, 1) for order in self.orders]
+        values = self._function("residual_levels", outputs).grid(t, x, self._p if p is None else p)
         ends = np.cumsum([0, *counts])
         return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
+
+    def along(self, plan, t):
+        """F along a plan, with its parameters, by name (N,); after its end that at its end."""
+        if not self.integrated:
+            return {}
+        run, places = plan.sampled(np.clip(t, *plan.span)), list(self.places)
+        names = [*self._names_of_state, *(self._q.jet_names(2) if self._order > 1 else ())]
+        x = np.array([run[name] if name in run.names else np.zeros(len(t)) for name in names])
+        model = plan.model
+        own = dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=False))
+        p, first = self._p.copy(), bool(self._names)
+        p[first : first + len(places)] = [own.get(self._own[i], self._values[i]) for i in places]
+        values = self.levels(run.t, x, p)
+        return {name: values[name][0] for name in self.integrated}
 
     def jacobian(self, t, x):
         """∂φ/∂x along states of the plant, (N, k, n_x)."""
@@ -149,6 +170,21 @@ def known_residuals(model, plant):
     return Residuals(model, plant, order=2)
 
 
+@lru_cache(32)
+def further_residuals(model, plant):
+    """The residuals of order 3 and more that are read by no F, as functions of as many jets; None without any."""
+    order, residuals = model.reduction.mechanism.q.order, as_read(model)[0]
+    rows = {name: e for name, e in residuals.items() if order(e) > 2}
+    return Residuals(model, plant, order=max(map(order, rows.values())), rows=rows) if rows else None
+
+
+def as_read(model):
+    """Residuals of a model's program, or their F in their place, and k by name of the latter."""
+    q, program, residuals = model.reduction.mechanism.q, model.reduction.program, program_residuals(model)
+    found = integrals(q, program)
+    return residuals | found, {name: q.order(residuals[name]) - q.order(F) for name, F in found.items()}
+
+
 def program_residuals(model):
     """Residuals of the program of a model, by name; of a plant under inputs those that it reports."""
     return model.reduction.program.residuals or model.reduction.mechanism.reported
@@ -164,8 +200,8 @@ def in_symbols_of(plant, model, expressions=None):
     expressions = program_residuals(model) if expressions is None else expressions
     if mechanism.q is plant.mechanism.q and mechanism.parameters is plant.mechanism.parameters:
         return dict(expressions)
-    new, old = _symbols(plant.mechanism), _symbols(mechanism)
     every = ca.vertcat(ca.SX(0, 1), *map(ca.vec, expressions.values()))
+    new, old = (_symbols(one, max(2, mechanism.q.order(every))) for one in (plant.mechanism, mechanism))
     names = [name for name, symbol in old.items() if ca.depends_on(every, symbol)]
     for name in names:
         named(name, new, "state or parameter of the plant")
@@ -177,6 +213,7 @@ def in_symbols_of(plant, model, expressions=None):
     return {name: ca.substitute(e, old, new) for name, e in expressions.items()}
 
 
-def _symbols(mechanism):
+def _symbols(mechanism, order):
     q, p = mechanism.q, mechanism.parameters
-    return {s.name(): s for s in (q.t, *q, *q.gamma(1), *q.gamma(2))} | dict(zip(p.names, p.symbols, strict=True))
+    jets = (s for k in range(1, order + 1) for s in q.gamma(k))
+    return {s.name(): s for s in (q.t, *q, *jets)} | dict(zip(p.names, p.symbols, strict=True))

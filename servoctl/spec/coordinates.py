@@ -45,6 +45,35 @@ class Column(ca.SX):
             return super().__array_function__(func, (ca.SX,), args, kwargs)
 
 
+class Rate(ca.SX):
+    """A total derivative that knows its antiderivative `of`, which sums with what has none keep."""
+
+    def __init__(self, value, of, k):
+        super().__init__(value)
+        self.of, self.k = of, k
+
+    def __getitem__(self, place):
+        return Rate(super().__getitem__(place), self.of[place], self.k)
+
+    def __neg__(self):
+        return Rate(super().__neg__(), -self.of, self.k)
+
+    def __add__(self, other):
+        value, alike = super().__add__(other), isinstance(other, Rate)
+        if value.shape != self.of.shape or alike and other.k != self.k:
+            return value
+        return Rate(value, self.of + other.of if alike else self.of, self.k)
+
+    def __sub__(self, other):
+        return self + (-other)
+
+    def __radd__(self, other):
+        return self + other
+
+    def __rsub__(self, other):
+        return -self + other
+
+
 class Coordinates:
     """Generalised coordinates q, quasi-velocities w with q' = V w + h (3.1), and jets of any order.
 
@@ -293,10 +322,14 @@ class Coordinates:
         Returns
         -------
         SX of the same shape
+            A residual that is the sum of it and functions of time has the expression as its integral.
         """
         items = column(expression, "the expression")
         result = ca.vertcat(*self.derivatives(items, _order(k))[k])
-        return ca.reshape(result, *expression.shape) if isinstance(expression, ca.SX) else result
+        if isinstance(expression, ca.SX):
+            result = ca.reshape(result, *expression.shape)
+        of, below = (expression.of, expression.k) if isinstance(expression, Rate) else (ca.vertcat(*items), 0)
+        return Rate(result, ca.reshape(of, *result.shape), k + below) if k else result
 
     def where(self, symbol):
         """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), ("r", k, i) for r_i^(k), or None."""
