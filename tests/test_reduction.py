@@ -834,4 +834,4 @@ def test_a_rolling_machine_of_few_velocities_is_programmed_by_rates():
 def test_rows_that_depend_at_a_point_are_no_rows_to_combine_by():
     rows = [SimpleNamespace(name=name) for name in "abc"]
     with refused(SingularProgram, rows=["a", "b"]):
-        hidden._combine(None, rows, 2, [0, 1], 2, np.ones((3, 3, 2)))
+        hidden._combine(None, rows, 2, [0, 1], 2, np.ones((3, 3, 2)), None)

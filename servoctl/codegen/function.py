@@ -219,11 +219,10 @@ class Compiled:
     def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
         """Steps of the Taylor method; the outputs are coefficients of q (unless plain) and γ by index, then pivots.
 
-        A step is as long as its last term meets the tolerance in q', γ', ..., γ^(s̄-1), which is for q relative to the
-        way of the step: `rtol` relative to the largest entry of each, and `atol`, a number, or (n_x,) where each entry
-        of a level is measured in its own. A step ends at each of `ends`, in the direction of motion; between two of
-        them paths have one branch, which the last parameter, an instant, selects. The state is projected after every
-        `project_every`-th step, never for 0.
+        A step is as long as its last term meets the tolerance at every level of the state: `rtol` relative to the
+        level's largest entry, and `atol`, a number, or (n_x,) where each entry of a level is measured in its own. A
+        step ends at each of `ends`, in the direction of motion; between two of them paths have one branch, which the
+        last parameter, an instant, selects. The state is projected after every `project_every`-th step, never for 0.
         Returns t, x and outputs at the starts of the S steps, and t and x at the end of the last one, as
         (S + 1, 1 + n_x + n_y); it lies before the last end if the step length vanishes, or S is `max_steps`.
         """

@@ -220,7 +220,7 @@ class Interpreter:
             c = of_q if plain else y[nq * last : (nq + n) * last].reshape(last, n)
             levels = zip(*(part[nq:].reshape(top - 1, n) for part in (x, w)), free, strict=True)
             of_rates = (longest((u * v)[i], (u * c)[:, i], j, rtol, atol) for j, (v, u, i) in enumerate(levels, 1))
-            h = rough_exp2(min(longest(w[:nq] * of_q[0], w[:nq] * of_q, 1, rtol, atol), *of_rates))
+            h = rough_exp2(min(longest(w[:nq] * x[:nq], w[:nq] * of_q, 0, rtol, atol), *of_rates))
             if not h > 1e-13 * (1 + abs(t)):
                 x = self._settle(t, x, p)
                 break
@@ -369,16 +369,16 @@ def weighted(atol):
     return atol.min(), atol.min() / atol
 
 
-def longest(rates, c, j, rtol, atol):
-    """log2 of the step at which the last term of rates of level j is in tolerance; c (last, n) are coefficients.
+def longest(level, c, j, rtol, atol):
+    """log2 of the step at which the last term of a level j of the state is in tolerance; c (last, n) are coefficients.
 
     Terms are taken to grow as the fastest of four of them.
     """
     last = len(c)
     k = np.array([last, last - 1, last // 2 + 1, last // 2])
     k = k[k > j]
-    falling = np.prod([k - m + 0.0 for m in range(j)], axis=0)
-    scale = rough_log2(atol / rtol + np.abs(rates).max(initial=0.0))
+    falling = np.prod([k - m + 0.0 for m in range(j)], axis=0) if j else np.ones(len(k))
+    scale = rough_log2(atol / rtol + np.abs(level).max(initial=0.0))
     terms = rough_log2(np.abs(c[k - 1]).max(axis=1, initial=0.0)) + rough_log2(falling)
     return np.min(np.log2(LAST_TERM * rtol) / (last - j) + (scale - terms) / (k - j), initial=np.inf)
 

@@ -37,12 +37,12 @@ INLINE W w_rough_exp2(W a)
     return w_value((whole + 1023) << 52) * (1.0 + f * (1.0 - BEND + BEND * f));
 }
 
-INLINE W w_largest(const W *v, int64_t n, int64_t first)
+INLINE W w_largest(const W *v, int64_t n, int64_t level)
 {
     W largest = ALL(0.0);
     int some = 0;
     UNROLLED for (int64_t i = 0; i < n; i++) {
-        if (first >= 0 && !IS_FREE(first + i)) continue;
+        if (level && !IS_FREE((level - 1) * N + i)) continue;
         largest = some ? w_larger_size(w_fabs(v[i]), largest) : w_fabs(v[i]);
         some = 1;
     }
@@ -50,14 +50,14 @@ INLINE W w_largest(const W *v, int64_t n, int64_t first)
 }
 
 /* `length` of taylor.c in lanes. */
-INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, int64_t first, double log_rtol, W least)
+INLINE W w_length(const W *x, const W *c, int64_t n, int64_t level, double log_rtol, W least)
 {
-    const W scale = w_rough_log2(least + w_largest(x, n, first));
+    const W scale = w_rough_log2(least + w_largest(x, n, level));
     W shortest = ALL(INFINITY);
     UNROLLED for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
-        if (k <= level) continue;
-        const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, first));
+        if (k <= level || k == 0) continue;
+        const W size = w_rough_log2(w_largest(c + (k - 1) * n, n, level));
         const double part = 1.0 / (double)(k - level);
         const double all = log_rtol * (1.0 / (double)(LAST - level)) - rough_log2(falling(k, level)) * part;
         shortest = w_lesser((scale - size) * part + all, shortest);
@@ -166,7 +166,7 @@ INLINE I off(const Motions *s, const W *c, double rtol)
 {
     I wrong = w_bits(ALL(0.0));
     UNROLLED for (int64_t j = 0; j < TOP; j++) {
-        W error = ALL(0.0), size = j ? w_largest(s->x + NQ + (j - 1) * N, N, -1) : w_largest(s->x, NQ, -1);
+        W error = ALL(0.0), size = j ? w_largest(s->x + NQ + (j - 1) * N, N, 0) : w_largest(s->x, NQ, 0);
         W part = ALL(falling(LAST, j) / falling(LAST, TOP - 1));
         for (int64_t m = j; m < TOP; m++) part *= s->h;
         UNROLLED for (int64_t i = 0; i < N; i++) {
@@ -192,9 +192,9 @@ void FN(many)(Many *m)
         if (stopped(m) || steps == m->most) break;
         expansion_moving(s.t, s.x, s.p, s.y, s.work);
         const W *c = s.y + (PLAIN ? 0 : NQ * LAST), least = s.atol / m->rtol;
-        W log_h = w_length(s.y, s.y, NQ, 1, -1, log_rtol, least);
+        W log_h = w_length(s.x, s.y, NQ, 0, log_rtol, least);
         for (int64_t j = 1; j < TOP; j++) {
-            const W of_level = w_length(s.x + NQ + (j - 1) * N, c, N, j, (j - 1) * N, log_rtol, least);
+            const W of_level = w_length(s.x + NQ + (j - 1) * N, c, N, j, log_rtol, least);
             log_h = w_lesser(of_level, log_h);
         }
         for (int64_t i = 0; i < N * (TOP - 1); i++) {

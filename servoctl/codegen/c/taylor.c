@@ -5,29 +5,29 @@
 #include "restore.h"
 #include "series.h"
 
-/* The bits of non-negative numbers have the order of the numbers, and those of NaN are largest. Of rates from the place
-   `first` of the state's only those count that are integrated, below zero all. The weights w (n) may be NULL for 1. */
-static inline double largest_size(const double *v, const double *w, int64_t n, int64_t first)
+/* The bits of non-negative numbers have the order of the numbers, and those of NaN are largest. Of a level of rates only
+   those count that are integrated. The weights w (n) may be NULL for 1. */
+static inline double largest_size(const double *v, const double *w, int64_t n, int64_t level)
 {
     int64_t largest = 0;
     for (int64_t i = 0; i < n; i++) {
         const int64_t bits = s_bits(w ? w[i] * fabs(v[i]) : fabs(v[i]));
-        largest = bits > largest && (first < 0 || IS_FREE(first + i)) ? bits : largest;
+        largest = bits > largest && (!level || IS_FREE((level - 1) * N + i)) ? bits : largest;
     }
     return s_value(largest);
 }
 
-/* log2 of the step at which the last term is 2^log_rtol of rates x, of a level, the terms taken to grow as the fastest of
-   some do: single coefficients may vanish. */
-static inline double length(const double *x, const double *c, const double *w, int64_t n, int64_t level, int64_t first,
-                            double log_rtol, double least)
+/* log2 of the step at which the last term is 2^log_rtol of a level x of the state, the terms taken to grow as the
+   fastest of some do: single coefficients may vanish. */
+static inline double length(const double *x, const double *c, const double *w, int64_t n, int64_t level, double log_rtol,
+                            double least)
 {
-    const double scale = rough_log2(least + largest_size(x, w, n, first));
+    const double scale = rough_log2(least + largest_size(x, w, n, level));
     double shortest = INFINITY;
     for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
-        if (k <= level) continue;
-        const double size = rough_log2(largest_size(c + (k - 1) * n, w, n, first));
+        if (k <= level || k == 0) continue;
+        const double size = rough_log2(largest_size(c + (k - 1) * n, w, n, level));
         const double growth = (scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
         const double h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
         shortest = h < shortest ? h : shortest;
@@ -35,14 +35,14 @@ static inline double length(const double *x, const double *c, const double *w, i
     return shortest;
 }
 
-/* The step h at which the last terms of all rates, q' too, as q has no origin, meet the tolerance; w (NX) may be NULL. */
+/* The step h at which the last terms of all levels meet the tolerance, with weights w (NX) of the state or NULL. */
 static inline double step_length(const double *x, const double *y, const double *w, double log_rtol, double least)
 {
     const double *c = y + (PLAIN ? 0 : NQ * LAST);
-    double log_h = length(y, y, w, NQ, 1, -1, log_rtol, least);
+    double log_h = length(x, y, w, NQ, 0, log_rtol, least);
     for (int64_t j = 1; j < TOP; j++) {
         const int64_t at = NQ + (j - 1) * N;
-        const double of_level = length(x + at, c, w ? w + at : w, N, j, (j - 1) * N, log_rtol, least);
+        const double of_level = length(x + at, c, w ? w + at : w, N, j, log_rtol, least);
         log_h = of_level < log_h ? of_level : log_h;
     }
     return rough_exp2(log_h);
