@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_complex, by_name, is_number, positive, whole
-from servoctl.control.companion import Sums, companion, fastest_poles, sampled_radius
+from servoctl.control.companion import Sums, companion, fastest_poles, sampled_radius, without_errors
 from servoctl.control.conditions import limits
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
@@ -46,7 +46,6 @@ def linearise(plan, plant, rows):
     `rows` is the program's `companion`. Refuses residuals that depend on no input, or not in proportion.
     """
     along = np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS)
-    rows.require_finite(along)
     extension = _Extension(plant, rows, _points(plan, plant), (along, _plant_states(plan, plant, along)))
     reduction = plan.model.reduction
     split, wish = reduction.realisation.actuation, desired_actuation(reduction.mechanism, reduction.program)
@@ -340,23 +339,23 @@ class _Extension:
         rest = iter(parts[3:])
         self.levels = [[next(rest) for _ in level] for level in self.levels]
 
-    def step(self, counts, low, high):
+    def step(self, counts, limits, inputs):
         """The linearisation by a decoupling matrix of full rank: (t, [x; z], column) -> [u; z+].
 
-        z is the controller state ξ and that of `sums`, of which `counts` are the numbers of poles by residual and `low`
-        and `high` (m,) the limits of the inputs. The column is [plant's parameters; Ts; increment of u; coefficients of
-        the error dynamics; jets of references; their jets half a sample before]. Returns the step, both jets and sums.
+        z is the controller state ξ and that of the `Sums`, to which the arguments are passed. The column is [plant's
+        parameters; Ts; increment of u; coefficients of the error dynamics; jets of references; their jets half a sample
+        before]. Returns the step, the former jets and the sums.
         """
         D, c = self.decoupling, [ca.SX.sym(f"c_{name}", n) for name, n in counts.items()]
         period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
-        sums = Sums(self, counts, period)
+        sums = Sums(self, counts, period, limits, inputs)
         tops = [ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape)) for level in self.levels]
         chains = zip(c, sums.now, self.levels, strict=True)
-        errors = [ca.dot(ci, ca.vertcat(*reversed(now), *level[:-1])) for ci, now, level in chains]
+        errors = [ca.dot(ci, ca.vertcat(*reversed(now.elements()), *level[:-1])) for ci, now, level in chains]
         target = -ca.vertcat(*(top + error for top, error in zip(tops, errors, strict=True)))
         self._substitute(self.v, self._solved(D, target))
         command = self.u + ahead
-        outputs = [command, self._advanced(period), *sums.after(command, low, high)]
+        outputs = [command, self._advanced(period), *sums.after(command)]
         jets = self.jets(outputs)
         column = ca.vertcat(self.numbers, period, ahead, *c, jets.symbols, sums.before)
         state = ca.vertcat(self.x, self.xi, sums.state)
@@ -438,12 +437,9 @@ def computed(
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
     _require_invertible(plan.model.reduction, plant)
-    rows = companion(plan, plant)
-    if not rows.of_plan:
-        _require_stable(plan)
+    rows = companion(plan, plant, np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS))
+    _require_stable(without_errors(plan) if any(rows.powers.values()) else plan)
     linear = linearise(plan, plant, rows)
-    if rows.of_plan:
-        _require_stable(rows.run_of(plan, max(linear.orders.values()) + 1))
     _require_smooth(plan, linear)
     orders, degrees = linear.needed, linear.orders
     poles = _poles(poles, orders)
@@ -451,8 +447,9 @@ def computed(
         _require_slow(name, values, reference.rate, delay, degrees[name])
     coefficients = [np.poly(values).real[:0:-1] for values in poles.values()]
     state = linear.controller_states(*(values[:1] for values in linear.along))[0]
-    low, high, _ = limits(plant, reference.period)
-    step, jets, sums = linear.step({name: len(values) for name, values in poles.items()}, low, high)
+    first = dict(zip(plant.inputs, reference.initial_input, strict=True))
+    counts = {name: len(values) for name, values in poles.items()}
+    step, jets, sums = linear.step(counts, limits(plant, reference.period), first)
     before = sums.jets.at(reference.t - reference.period / 2)
     rows = zip(reference.ahead(delay).T, jets.at(reference.t).T, before.T, strict=True)
     columns = ([plant.parameters, [reference.period], u, *coefficients, r, b] for u, r, b in rows)
@@ -468,12 +465,12 @@ def computed(
         t0=float(plan.t[0]),
         step=step,
         schedule=np.column_stack([np.concatenate(column) for column in columns]),
-        state=np.concatenate([state, sums.start(plan)]),
+        state=np.append(state, sums.start),
         state_names=(*linear.state_names, *sums.names),
         initial_input=reference.initial_input,
         plan=plan,
         info=info,
-        integrators=tuple(len(state) + i for i in sums.integrators),
+        integrators=tuple(range(len(state) + len(sums.start))[len(state) + len(sums.start) - sums.count :]),
     )
 
 
