@@ -14,14 +14,12 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen.function import compiled
-from servoctl.control.residuals import as_read, in_symbols_of, paths_along
+from servoctl.control.residuals import Along, as_read, in_symbols_of, paths_along
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import SpecificationError
 from servoctl.methods.stability import FASTEST, HALVINGS
 from servoctl.model.equations import Equations
-from servoctl.model.jets import extended
 from servoctl.model.model import Model
-from servoctl.spec.references import Jets
 from servoctl.values import frozen
 
 SUFFIX = " along the plan"  # of the reference that F follows
@@ -91,36 +89,6 @@ def without_errors(plan):
     models = {id(piece.model): held(piece.model) for piece in plan.steps} | {id(plan.model): held(plan.model)}
     steps = tuple(replace(piece, model=models[id(piece.model)]) for piece in plan.steps)
     return replace(plan, model=models[id(plan.model)], steps=steps)
-
-
-class Along:
-    """An expression F along a plan as the path of a reference: values and derivatives of any order at any instant."""
-
-    def __init__(self, plan, F):
-        self._plan, self._F, self._functions = plan, F, {}
-
-    def held(self):
-        """Itself: outside the plan it is held."""
-        return self
-
-    def jets(self, t, order):
-        """Derivatives 0 to `order`, (order + 1, 1, N), at times (N,)."""
-        plan, model = self._plan, self._plan.model
-        if order not in self._functions:
-            self._functions[order] = self._function(order)
-        f, jets = self._functions[order]
-        t, places = np.unique(np.clip(t, *plan.span), return_inverse=True)
-        z, size = plan.at(t), f.size1_in(1)
-        z = z[:size] if len(z) >= size else extended(model, t, z, size)
-        return np.array(f(t[None], z, model.parameters, jets.at(t)))[:, None, places]
-
-    def _function(self, order):
-        """A function (t, jets, parameters, jets of references) of these derivatives, and the latter."""
-        model, q = self._plan.model, self._plan.model.reduction.mechanism.q
-        levels = ca.vertcat(*(level[0] for level in q.derivatives([self._F], order)))
-        jets, p = Jets(q, [levels], model.paths), ca.vertcat(ca.SX(0, 1), *model.reduction.mechanism.parameters.symbols)
-        z = ca.vertcat(*(q.jet(i) for i in range(q.order(levels) + 1)))
-        return ca.Function("along", [q.t, z, p, jets.symbols], [levels]), jets
 
 
 class Sums:

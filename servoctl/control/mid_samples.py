@@ -1,4 +1,4 @@
-"""Residuals of order 2 and more along a closed loop, in the middle of each sample or by differences.
+"""Residuals of order 2 and more along a closed loop, in the middle of each sample.
 
 Under held inputs the derivatives of an acceleration are almost zero inside samples, and pulses between them: just after
 a sample an acceleration is half a sample ahead of a plan that moves, and a residual of order 3 shows nothing.
@@ -6,55 +6,43 @@ a sample an acceleration is half a sample ahead of a plan that moves, and a resi
 
 import numpy as np
 
-from servoctl.control.residuals import further_residuals, known_residuals
+from servoctl.control.residuals import known_residuals
 
 WINDOW = 0.1  # s of a difference quotient: noise σ of F becomes √2 σ/H in the first, √6 σ/H² in the second
 
 
-def program_rows(run, accelerations):
-    """Residuals of the plan's program along a loop, (levels, N) by name, in the order of the program.
-
-    `accelerations` (n, N) are those right after the samples.
-    """
-    model, plant = run.plan.model, run.plant
-    known, further = known_residuals(model, plant), further_residuals(model, plant)
-    rows = known.levels(run.t, np.vstack([run.states, accelerations]))
-    late = [name for name, k in zip(known.names, known.orders, strict=True) if k > 1 or name in known.integrated]
-    if len(run.t) < 2:
-        return {name: row for name, row in rows.items() if name not in known.integrated}
-    if late:
-        t, jets = _middles(run)
-        at, along = known.levels(t, jets), known.along(run.plan, t)
-        for name in late:
-            row, k = at[name] - along.get(name, 0.0), known.integrated.get(name, 0)
+def program_rows(run):
+    """Residuals of the plan's program along a loop, (levels, N) by name; without those for which it is too short."""
+    known, n = known_residuals(run.plan.model, run.plant), run.plant.mechanism.q.n
+    rows = known.levels(run.t, np.vstack([run.states, np.zeros((n * (known.order - 1), len(run.t)))]))
+    t, jets = _middles(run, known.order)
+    at, along = known.levels(t, jets), known.along(run.plan, t)
+    for name, order in zip(known.names, known.orders, strict=True):
+        k, edge = known.integrated.get(name, 0), (order > 2) * (order + 1) // 2
+        if order > 1 or k:
+            row = at[name][:, edge : len(t) - edge] - along.get(name, 0.0)
             row = np.vstack([row, quotient(row[0], k, run.loop.period)]) if k else row
-            rows[name] = np.concatenate([row, row[:, -1:]], axis=1)
-    if further and len(run.t) > (inner := 2 * (max(further.orders) // 2)):
-        edge = inner // 2
-        at = further.levels(run.t[edge : len(run.t) - edge], _differences(run, max(further.orders), edge))
-        rows |= {name: _widened(row, len(run.t)) for name, row in at.items()}
-    return {name: rows[name] for name in (*model.reduction.program.names, *rows) if name in rows}
+            rows[name] = _widened(row, len(run.t))
+    return {name: row for name, row in rows.items() if row.size}
 
 
-def _middles(run):
-    """Instants (N - 1,), and states and accelerations (n_x + n, N - 1) there: polynomials through states and rates."""
-    plant, x, h = run.plant, run.states, run.loop.period
-    starts, ends, t = run.p_within(0)[:, :-1], run.p_within(2)[:, :-1], run.t[:-1] + h / 2
+def _middles(run, order):
+    """Instants (N - 1,) and the jets up to γ^(order) there.
+
+    States by polynomials through states and rates, accelerations of the plant, and differences of the velocities.
+    """
+    plant, x, h, t = run.plant, run.states, run.loop.period, run.t[:-1] + run.loop.period / 2
+    nq, n, (start, middle, end) = plant.mechanism.q.nq, plant.mechanism.q.n, (run.p_within(i)[:, :-1] for i in range(3))
     ode = plant.function("ode")
-    first, last = ode.grid(run.t[:-1], x[:, :-1], starts), ode.grid(run.t[1:], x[:, 1:], ends)
-    middle = (x[:, :-1] + x[:, 1:]) / 2 + h / 8 * (first - last)[: len(x)]
-    return t, np.vstack([middle, plant.function("accelerations").grid(t, middle, run.p_within(1)[:, :-1])])
-
-
-def _differences(run, order, edge):
-    """States and jets γ'' to γ^(order) at samples but some at either edge, by central differences of velocities."""
-    nq, n, count = run.plant.mechanism.q.nq, run.plant.mechanism.q.n, len(run.t) - 2 * edge
-    levels = [run.states]
-    for k in range(1, order):
-        level = np.diff(run.states[nq : nq + n], k, axis=1) / run.loop.period**k
-        levels.append((level[:, 1:] + level[:, :-1]) / 2 if k % 2 else level)  # odd ones are those between samples
-    cuts = [(level.shape[1] - count) // 2 for level in levels]
-    return np.vstack([level[:, cut : cut + count] for level, cut in zip(levels, cuts, strict=True)])
+    change = ode.grid(run.t[:-1], x[:, :-1], start) - ode.grid(run.t[1:], x[:, 1:], end)
+    x = (x[:, :-1] + x[:, 1:]) / 2 + h / 8 * change[: len(x)]
+    levels = [x, plant.function("accelerations").grid(t, x, middle)]
+    for k in range(2, order):
+        level = np.diff(run.states[nq : nq + n], k) / h**k
+        if k % 2 == 0:  # those at samples, by the cubic through four of them
+            level = (9 * (level[:, 1:-2] + level[:, 2:-1]) - level[:, :-3] - level[:, 3:]) / 16
+        levels.append(_widened(level, len(t)) if level.size else np.full((n, len(t)), np.nan))
+    return t, np.vstack(levels)
 
 
 def _widened(values, count):

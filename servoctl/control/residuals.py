@@ -9,6 +9,7 @@ from servoctl.checks import named, rows_read
 from servoctl.codegen.function import compiled
 from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError, unknown
+from servoctl.model.jets import extended
 from servoctl.spec.integrals import integrals
 from servoctl.spec.references import Jets, function_of, orders_in
 
@@ -18,13 +19,14 @@ class Residuals:
 
     A residual of order 3 or more, which is the k-th derivative of F and a function of time, is read by F. `names`
     selects some, and may name outputs of the mechanism and states: their residual, as that of F, is the deviation from
-    the plan. `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations, more with further
-    jets. `rows` are residuals by name in place of the program's.
+    the plan. `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations; None for all.
 
     Attributes
     ----------
     names, orders : tuple
         Names and orders of the residuals.
+    order : int
+        The order of the jets that they take, which are at least accelerations where `order` is None.
     expressions, symbols : SX, list of SX
         The residuals in the plant's symbols, and the parameters on which they depend, followed by values along the
         plan and by jets of references.
@@ -42,10 +44,9 @@ class Residuals:
         The states on which the residuals depend.
     """
 
-    def __init__(self, model, plant, names=None, order=1, rows=None):
-        mechanism = model.reduction.mechanism
-        residuals, integrated = as_read(model) if rows is None else (rows, {})
-        q, planned, along = mechanism.q, _planned(mechanism), {}
+    def __init__(self, model, plant, names=None, order=1):
+        mechanism, (residuals, integrated) = model.reduction.mechanism, as_read(model)
+        q, planned, along, read = mechanism.q, _planned(mechanism), {}, dict(zip(residuals, residuals, strict=True))
         if names is not None:  # which are signals, or else rows
             read = rows_read(residuals, mechanism.signals)
             integrated = {name: integrated[row] for name, row in read.items() if row in integrated}
@@ -54,6 +55,7 @@ class Residuals:
             valid = {name: q.order(e) for name, e in (rows | planned).items()}
             residuals = {name: (rows | planned)[name] - along.get(name, 0) for name in valid if name in names}
         orders = {name: q.order(e) for name, e in residuals.items()}
+        self.order = order = max(2, *orders.values()) if order is None else order
         for name in names or ():
             if name not in orders:
                 raise unknown(name, valid, "residual, output or state")
@@ -70,7 +72,7 @@ class Residuals:
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         chosen = in_symbols_of(plant, model, {name: residuals[name] for name in self.names})
         self.expressions = ca.vertcat(*chosen.values())
-        self._q, self._state, self._order = plant.mechanism.q, plant.equations.state, order
+        self._q, self._state = plant.mechanism.q, plant.equations.state
         parameters = plant.mechanism.parameters.symbols
         self.places = tuple(i for i, s in enumerate(parameters) if ca.depends_on(self.expressions, s))
         self.paths = paths_along(model, plant)
@@ -79,8 +81,7 @@ class Residuals:
         self.parameters = np.append(plant.parameters[list(self.places)], np.zeros(len(along) + len(self.jets)))
         self.planned = tuple(along)
         self.integrated = {name: k for name, k in integrated.items() if name in self.names}
-        self._names_of_state, self._values = plant.state_names, plant.parameters
-        self._own = plant.mechanism.parameters.names
+        self._rows = {name: read[name] for name in self.integrated}
         states = zip(plant.state_names, self._state.elements(), strict=True)
         self._measured = {name: s for name, s in states if ca.depends_on(self.expressions, s)}
         self.measures = tuple(self._measured)
@@ -95,7 +96,7 @@ class Residuals:
     def _function(self, name, outputs):
         """A compiled function of (t, states, p), with accelerations below the states for order 2."""
         if name not in self._built:
-            x = ca.vertcat(self._state, *(s for k in range(2, self._order + 1) for s in self._q.gamma(k)))
+            x = ca.vertcat(self._state, *(s for k in range(2, self.order + 1) for s in self._q.gamma(k)))
             y, p = ca.densify(ca.cse(ca.vertcat(*outputs()))), self.symbols[: len(self.symbols) - len(self.jets)]
             f = function_of(self._q, self._names, name, x, ca.vertcat(ca.SX(0, 1), *p), y)
             self._built[name] = compiled(f, name)
@@ -114,7 +115,7 @@ class Residuals:
         self._followed = Followed([self.paths[name].held() for name in self._names])
         return np.append(self._followed.address, numbers)
 
-    def levels(self, t, x, p=None):
+    def levels(self, t, x):
         """Residuals, and the derivative of those of order 0: (2, N) and (1, N) arrays by name.
 
         `x` (n_x, N) are states of the plant at t (N,); for order 2 and more with the further jets below the states.
@@ -125,23 +126,14 @@ class Residuals:
             items = zip(self.expressions.elements(), counts, strict=True)
             return [level[0] for e, count in items for level in self._q.derivatives([e], count - 1)]
 
-        values = self._function("residual_levels", outputs).grid(t, x, self._p if p is None else p)
+        values = self._function("residual_levels", outputs).grid(t, x, self._p)
         ends = np.cumsum([0, *counts])
         return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
 
     def along(self, plan, t):
-        """F along a plan, with its parameters, by name (N,); after its end that at its end."""
-        if not self.integrated:
-            return {}
-        run, places = plan.sampled(np.clip(t, *plan.span)), list(self.places)
-        names = [*self._names_of_state, *(self._q.jet_names(2) if self._order > 1 else ())]
-        x = np.array([run[name] if name in run.names else np.zeros(len(t)) for name in names])
-        model = plan.model
-        own = dict(zip(model.reduction.mechanism.parameters.names, model.parameters, strict=False))
-        p, first = self._p.copy(), bool(self._names)
-        p[first : first + len(places)] = [own.get(self._own[i], self._values[i]) for i in places]
-        values = self.levels(run.t, x, p)
-        return {name: values[name][0] for name in self.integrated}
+        """F along a plan by name, (N,) each."""
+        read = as_read(plan.model)[0]
+        return {name: Along(plan, read[row]).jets(t, 0)[0, 0] for name, row in self._rows.items()}
 
     def jacobian(self, t, x):
         """∂φ/∂x along states of the plant, (N, k, n_x)."""
@@ -151,6 +143,36 @@ class Residuals:
 
         values = self._function("residual_jacobian", outputs).grid(t, x, self._p)
         return values.reshape(-1, len(self.names), len(t)).transpose(2, 1, 0)
+
+
+class Along:
+    """An expression F along a plan as the path of a reference: values and derivatives of any order at any instant."""
+
+    def __init__(self, plan, F):
+        self._plan, self._F, self._functions = plan, F, {}
+
+    def held(self):
+        """Itself: outside the plan it is held."""
+        return self
+
+    def jets(self, t, order):
+        """Derivatives 0 to `order`, (order + 1, 1, N), at times (N,)."""
+        plan, model = self._plan, self._plan.model
+        if order not in self._functions:
+            self._functions[order] = self._function(order)
+        f, jets = self._functions[order]
+        t, places = np.unique(np.clip(t, *plan.span), return_inverse=True)
+        z, size = plan.at(t), f.size1_in(1)
+        z = z[:size] if len(z) >= size else extended(model, t, z, size)
+        return np.array(f(t[None], z, model.parameters, jets.at(t)))[:, None, places]
+
+    def _function(self, order):
+        """A function (t, jets, parameters, jets of references) of these derivatives, and the latter."""
+        model, q = self._plan.model, self._plan.model.reduction.mechanism.q
+        levels = ca.vertcat(*(level[0] for level in q.derivatives([self._F], order)))
+        jets, p = Jets(q, [levels], model.paths), ca.vertcat(ca.SX(0, 1), *model.reduction.mechanism.parameters.symbols)
+        z = ca.vertcat(*(q.jet(i) for i in range(q.order(levels) + 1)))
+        return ca.Function("along", [q.t, z, p, jets.symbols], [levels]), jets
 
 
 def paths_along(model, plant):
@@ -166,16 +188,8 @@ def _planned(mechanism):
 
 @lru_cache(32)
 def known_residuals(model, plant):
-    """All residuals up to order 2, whose functions are derived once for a model and a plant."""
-    return Residuals(model, plant, order=2)
-
-
-@lru_cache(32)
-def further_residuals(model, plant):
-    """The residuals of order 3 and more that are read by no F, as functions of as many jets; None without any."""
-    order, residuals = model.reduction.mechanism.q.order, as_read(model)[0]
-    rows = {name: e for name, e in residuals.items() if order(e) > 2}
-    return Residuals(model, plant, order=max(map(order, rows.values())), rows=rows) if rows else None
+    """All residuals, whose functions are derived once for a model and a plant."""
+    return Residuals(model, plant, order=None)
 
 
 def as_read(model):

@@ -199,7 +199,7 @@ class Closed(Sampled, Value):
         the residual, over windows of 0.1 s. One without F is evaluated with central differences of the velocities. The
         last sample, which has no middle, has the values of the one before.
         """
-        residuals = program_rows(self, self._evaluated("accelerations")) if self.plan is not None else {}
+        residuals = program_rows(self) if self.plan is not None else {}
         if self.plant.constrained:
             values = self.plant.function("constraints").grid(self.t, self.states, self.plant.p())
             residuals |= {name: value[None] for name, value in zip(self.plant.constraint_names(), values, strict=True)}
