@@ -20,53 +20,40 @@ from servoctl.errors import SpecificationError
 from servoctl.methods.stability import FASTEST, HALVINGS
 from servoctl.model.equations import Equations
 from servoctl.model.model import Model
-from servoctl.values import frozen
 
 SUFFIX = " along the plan"  # of the reference that F follows
 
 
-@frozen(eq=False)
 class Companion:
-    """Rows that a law feeds back, in a plant's symbols, with coordinates that have F along the plan as references.
+    """Rows that a law feeds back, in a plant's symbols, with coordinates `q` that have F along the plan as references.
 
     `rows` are expressions by name, `paths` of all references by name, `powers` the k by name: 0 for rows that are fed
-    back themselves.
+    back themselves. Refuses rows of order 3 or more without F, and F without a value at instants t (N,) of the plan.
     """
 
-    q: object
-    rows: dict
-    paths: dict
-    powers: dict
-
-
-def companion(plan, plant, t):
-    """The `Companion` of a plan's program; refuses rows of order 3 or more without F, and F without a value at t (N,).
-
-    The instants are those of the plan.
-    """
-    model = plan.model
-    read, powers = as_read(model)
-    follow = {name + SUFFIX: Along(plan, read[name]) for name in powers}
-    for name, row in read.items():
-        if (order := model.reduction.mechanism.q.order(row)) > 2:
-            raise SpecificationError(
-                f"The residual {name!r} has order {order}, and no F is known of which it is a derivative.",
-                "Set to zero in a model it would be no feedback; F minus F along the plan is what can be fed back.",
-                do=f"Use sv.lqr, which follows plans of any order, or state integrals={{{name!r}: F}} in the Program.",
-                name=name,
-                order=order,
-            )
-        if name in powers and (lost := ~np.isfinite(follow[name + SUFFIX].jets(t, 0)[0, 0])).any():
-            raise SpecificationError(
-                f"What {name!r} is a derivative of has no value at t = {t[lost][0]:.6g} s of the plan.",
-                "It is fed back along the whole plan; a curvature has no value at a speed of zero.",
-                do="Follow the plan by sv.lqr, or begin it where the value is finite.",
-                name=name,
-                t=float(t[lost][0]),
-            )
-    q, rows = plant.mechanism.q.beside(**dict.fromkeys(follow))[0], in_symbols_of(plant, model, read)
-    rows |= {name: rows[name] - q.family.jet(name + SUFFIX, 0) for name in powers}
-    return Companion(q, rows, paths_along(model, plant) | follow, {name: powers.get(name, 0) for name in rows})
+    def __init__(self, plan, plant, t):
+        model, (read, powers) = plan.model, as_read(plan.model)
+        follow = {name + SUFFIX: Along(plan, read[name]) for name in powers}
+        for name, row in read.items():
+            if (order := model.reduction.mechanism.q.order(row)) > 2:
+                raise SpecificationError(
+                    f"The residual {name!r} has order {order}, and no F is known of which it is a derivative.",
+                    "Set to zero in a model it would be no feedback; F minus F along the plan is what can be fed back.",
+                    do=f"Use sv.lqr, which follows plans of any order, or state integrals={{{name!r}: F}}.",
+                    name=name,
+                    order=order,
+                )
+            if name in powers and (lost := ~np.isfinite(follow[name + SUFFIX].jets(t, 0)[0, 0])).any():
+                raise SpecificationError(
+                    f"What {name!r} is a derivative of has no value at t = {t[lost][0]:.6g} s of the plan.",
+                    "It is fed back along the whole plan; a curvature has no value at a speed of zero.",
+                    do="Follow the plan by sv.lqr, or begin it where the value is finite.",
+                    name=name,
+                    t=float(t[lost][0]),
+                )
+        self.q, rows = plant.mechanism.q.beside(**dict.fromkeys(follow))[0], in_symbols_of(plant, model, read)
+        self.rows = rows | {name: rows[name] - self.q.family.jet(name + SUFFIX, 0) for name in powers}
+        self.paths, self.powers = paths_along(model, plant) | follow, dict.fromkeys(rows, 0) | powers
 
 
 def without_errors(plan):

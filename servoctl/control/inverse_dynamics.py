@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_complex, by_name, is_number, positive, whole
-from servoctl.control.companion import Sums, companion, fastest_poles, sampled_radius, without_errors
+from servoctl.control.companion import Companion, Sums, fastest_poles, sampled_radius, without_errors
 from servoctl.control.conditions import limits
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
@@ -43,7 +43,7 @@ TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits 
 def linearise(plan, plant, rows):
     """The extension that a plant needs for exact linearisation of a program; ranks are decided about the plan's states.
 
-    `rows` is the program's `companion`. Refuses residuals that depend on no input, or not in proportion.
+    `rows` is the program's `Companion`. Refuses residuals that depend on no input, or not in proportion.
     """
     along = np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS)
     extension = _Extension(plant, rows, _points(plan, plant), (along, _plant_states(plan, plant, along)))
@@ -134,11 +134,8 @@ class _Extension:
 
         Behind integrators or lags an F with accelerations is known by the model alone; one pole more measures it.
         """
-        found = {}
-        for name, r in self.orders.items():
-            hidden = r > 0 and self.powers[name] > 0 and self.q.order(self.rows[name]) > 1
-            found[name] = max(self.powers[name], r + hidden, 1)
-        return found
+        by_model = {name: k > 0 and self.q.order(self.rows[name]) > 1 for name, k in self.powers.items()}
+        return {name: max(self.powers[name], r + (r > 0 and by_model[name]), 1) for name, r in self.orders.items()}
 
     def _require_affine(self):
         """Refuse rows whose accelerations do not enter in proportion."""
@@ -437,7 +434,7 @@ def computed(
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
     _require_invertible(plan.model.reduction, plant)
-    rows = companion(plan, plant, np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS))
+    rows = Companion(plan, plant, np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS))
     _require_stable(without_errors(plan) if any(rows.powers.values()) else plan)
     linear = linearise(plan, plant, rows)
     _require_smooth(plan, linear)

@@ -149,7 +149,7 @@ class Along:
     """An expression F along a plan as the path of a reference: values and derivatives of any order at any instant."""
 
     def __init__(self, plan, F):
-        self._plan, self._F, self._functions = plan, F, {}
+        self._plan, self._F = plan, F
 
     def held(self):
         """Itself: outside the plan it is held."""
@@ -157,22 +157,15 @@ class Along:
 
     def jets(self, t, order):
         """Derivatives 0 to `order`, (order + 1, 1, N), at times (N,)."""
-        plan, model = self._plan, self._plan.model
-        if order not in self._functions:
-            self._functions[order] = self._function(order)
-        f, jets = self._functions[order]
-        t, places = np.unique(np.clip(t, *plan.span), return_inverse=True)
-        z, size = plan.at(t), f.size1_in(1)
-        z = z[:size] if len(z) >= size else extended(model, t, z, size)
-        return np.array(f(t[None], z, model.parameters, jets.at(t)))[:, None, places]
-
-    def _function(self, order):
-        """A function (t, jets, parameters, jets of references) of these derivatives, and the latter."""
-        model, q = self._plan.model, self._plan.model.reduction.mechanism.q
+        plan, model, mechanism = self._plan, self._plan.model, self._plan.model.reduction.mechanism
+        q, p = mechanism.q, ca.vertcat(ca.SX(0, 1), *mechanism.parameters.symbols)
         levels = ca.vertcat(*(level[0] for level in q.derivatives([self._F], order)))
-        jets, p = Jets(q, [levels], model.paths), ca.vertcat(ca.SX(0, 1), *model.reduction.mechanism.parameters.symbols)
-        z = ca.vertcat(*(q.jet(i) for i in range(q.order(levels) + 1)))
-        return ca.Function("along", [q.t, z, p, jets.symbols], [levels]), jets
+        symbols, jets = ca.vertcat(*(q.jet(i) for i in range(q.order(levels) + 1))), Jets(q, [levels], model.paths)
+        t, places = np.unique(np.clip(t, *plan.span), return_inverse=True)
+        z, size = plan.at(t), symbols.numel()
+        z = z[:size] if len(z) >= size else extended(model, t, z, size)
+        f = ca.Function("along", [q.t, symbols, p, jets.symbols], [levels])
+        return np.array(f(t[None], z, model.parameters, jets.at(t)))[:, None, places]
 
 
 def paths_along(model, plant):

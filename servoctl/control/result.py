@@ -132,16 +132,11 @@ class Closed(Sampled, Value):
             inputs = np.take_along_axis(inputs, np.maximum(sent, 0), axis=1)
             inputs = np.where(sent < 0, loop.initial_input[:, None], inputs)
         p = self.plant.p(inputs)
-        p[loop.disturbed] = self._disturbances_within(step, stage)
+        p[loop.disturbed] = self._disturbances(step, stage)
         return p
 
-    @cached_property
-    def _disturbances(self):
-        """Disturbances right after each sample, (n_d, N)."""
-        return self._disturbances_within(0, 0)
-
-    def _disturbances_within(self, step, stage):
-        """Disturbances at the start, in the middle or at the end (stage 0, 1 or 2) of a step of each sample."""
+    def _disturbances(self, step, stage):
+        """Disturbances (n_d, N) at the start, in the middle or at the end (stage 0, 1, 2) of a step of each sample."""
         loop = self.loop
         if loop.disturbance is None:
             return np.zeros((0, len(self.t)))
@@ -170,7 +165,7 @@ class Closed(Sampled, Value):
     def disturbance(self) -> dict[str, np.ndarray]:
         """Disturbances right after each sample, (N,) by generalised force, and by parameter where that is disturbed."""
         calm = {name: np.zeros(len(self.t)) for name in self.plant.disturbable}
-        return calm | dict(zip(self.conditions.disturbance, self._disturbances, strict=True))
+        return calm | dict(zip(self.conditions.disturbance, self._disturbances(0, 0), strict=True))
 
     @property
     def signal(self) -> dict[str, np.ndarray]:

@@ -269,24 +269,12 @@ def _law(law, name, quantum=None):
     def answer(t, z, y):
         return law.answer(t, np.append(quantised(y, quantum), z), law.schedule_at(t))
 
-    def update(t, z, y, _):
-        given = answer(t, z, y)[: m + n_z]
-        if not np.isfinite(given).all():
-            raise ServoError(
-                f"The law {law.name!r} returned NaN or infinity at t = {t:.6g} s.",
-                "A command is a finite number at each sample.",
-                do="Check the law at this measurement.",
-                name=law.name,
-                t=float(t),
-            )
-        return given[m:]
-
     def output(t, z, y, _):
         u = answer(t, z, y)[:m]
-        return np.nan_to_num(u) if n_z else u  # python-control asks for it at y = 0 first, and `update` refuses NaN
+        return u if np.any(y) else np.nan_to_num(u)  # python-control asks for it at y = 0 first
 
     return control.nlsys(
-        update if n_z else None,
+        (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,
         output,
         name=name,
         inputs=signal_names(law.measures, law.inputs),

@@ -45,8 +45,22 @@ class Column(ca.SX):
             return super().__array_function__(func, (ca.SX,), args, kwargs)
 
 
+def _linear(name):
+    """A linear operation of SX that finds the antiderivative, too; what has none counts as a function of time."""
+
+    def applied(self, *others):
+        operation = getattr(ca.SX, name)
+        value, of = operation(self, *others), operation(self.of, *(getattr(one, "of", 0) for one in others))
+        same = value.shape == self.shape and all(getattr(one, "k", self.k) == self.k for one in others)
+        return Rate(value, of, self.k) if same else value
+
+    return applied
+
+
 class Rate(ca.SX):
-    """A total derivative that knows its antiderivative `of`, which sums with what has none keep."""
+    """A k-th total derivative that knows its antiderivative `of`, which sums keep."""
+
+    __add__, __radd__, __sub__, __rsub__, __neg__ = map(_linear, "__add__ __radd__ __sub__ __rsub__ __neg__".split())
 
     def __init__(self, value, of, k):
         super().__init__(value)
@@ -54,24 +68,6 @@ class Rate(ca.SX):
 
     def __getitem__(self, place):
         return Rate(super().__getitem__(place), self.of[place], self.k)
-
-    def __neg__(self):
-        return Rate(super().__neg__(), -self.of, self.k)
-
-    def __add__(self, other):
-        value, alike = super().__add__(other), isinstance(other, Rate)
-        if value.shape != self.of.shape or alike and other.k != self.k:
-            return value
-        return Rate(value, self.of + other.of if alike else self.of, self.k)
-
-    def __sub__(self, other):
-        return self + (-other)
-
-    def __radd__(self, other):
-        return self + other
-
-    def __rsub__(self, other):
-        return -self + other
 
 
 class Coordinates:
@@ -326,10 +322,10 @@ class Coordinates:
         """
         items = column(expression, "the expression")
         result = ca.vertcat(*self.derivatives(items, _order(k))[k])
-        if isinstance(expression, ca.SX):
-            result = ca.reshape(result, *expression.shape)
+        shape = expression.shape if isinstance(expression, ca.SX) else result.shape
         of, below = (expression.of, expression.k) if isinstance(expression, Rate) else (ca.vertcat(*items), 0)
-        return Rate(result, ca.reshape(of, *result.shape), k + below) if k else result
+        result, of = ca.reshape(result, *shape), ca.reshape(of, *shape)
+        return Rate(result, of, k + below) if k else result
 
     def where(self, symbol):
         """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), ("r", k, i) for r_i^(k), or None."""

@@ -6,36 +6,31 @@ import numpy as np
 from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread, vanish
 
-SEED = 310  # of the jets at which an error shows by how much a stated F is wrong
-
 
 def integrals(q, program):
     """F by row: those that are stated, and for rows of an order above 2 those that `q.dt` wrote."""
     found = {}
     for name, residual in program.residuals.items():
-        F = program.stated.get(name) if q.order(residual) <= 2 else (program.integrals | program.stated).get(name)
-        if F is not None and 0 <= q.order(F) <= min(2, q.order(residual) - 1):
-            slopes = [slope for _, slope in _left(q, residual, F)]
-            if not slopes or vanish(spread(slopes)).all():
-                found[name] = F
+        order = q.order(residual)
+        F = (program.stated if order <= 2 else program.integrals | program.stated).get(name)
+        if F is not None and 0 <= q.order(F) <= min(2, order - 1) and not _left(q, residual, F):
+            found[name] = F
     return found
 
 
 def _left(q, residual, F):
-    """Jets on which ψ - D^k F depends by its expression, and its slopes by them."""
+    """Jets on which ψ - D^k F depends, and its slopes by them."""
     k = q.order(residual) - q.order(F)
     rest = residual - q.derivatives([F], k)[k][0]
     jets = [s for s in ca.symvar(rest) if q.is_jet(s)]
-    slopes = ca.gradient(rest, ca.vertcat(ca.SX(0, 1), *jets))
-    return [(jet, slopes[i]) for i, jet in enumerate(jets) if slopes[i].nnz() and not slopes[i].is_zero()]
+    slopes = ca.densify(ca.gradient(rest, ca.vertcat(*jets))).elements() if jets else []
+    zeros = vanish(spread(slopes)) if jets else []
+    return [pair for *pair, zero in zip(jets, slopes, zeros, strict=True) if not zero]
 
 
 def require_integrals(q, program):
     """Refuse stated integrals that are of no order below their residual's, up to 2, or do not give it."""
-    valid = integrals(q, program)
     for name, F in program.stated.items():
-        if name in valid:
-            continue
         residual, order = program.residuals[name], q.order(F)
         if not 0 <= order <= min(2, q.order(residual) - 1):
             raise SpecificationError(
@@ -45,19 +40,20 @@ def require_integrals(q, program):
                 name=name,
                 order=order,
             )
-        jets, slopes = zip(*_left(q, residual, F), strict=True)
-        symbols = ca.symvar(ca.vertcat(*slopes, *jets))
-        values = np.random.default_rng(SEED).uniform(0.5, 1.5, len(symbols)).round(2)
-        off = np.ravel(ca.Function("off", [ca.vertcat(*symbols)], [ca.vertcat(*slopes)])(values))
-        worst, k = int(np.argmax(np.abs(off))), q.order(residual) - order
-        at = ", ".join(f"{s.name()} = {v:g}" for s, v in zip(symbols, values, strict=True))
-        raise SpecificationError(
-            f"The derivative of order {k} of the integral of {name!r} is not the residual: their difference has the "
-            f"slope {off[worst]:.4g} by {jets[worst].name()} at {at[:300]}.",
-            "ψ = D^k F + ρ(t): what they differ by is a function of time alone.",
-            do=f"State another F, or leave {name!r} out of integrals and follow the plan by sv.lqr.",
-            name=name,
-            jet=jets[worst].name(),
-            slope=float(off[worst]),
-            at=dict(zip([s.name() for s in symbols], values.tolist(), strict=True)),
-        )
+        if left := _left(q, residual, F):
+            jets, slopes = (ca.vertcat(*part) for part in zip(*left, strict=True))
+            symbols = sorted(ca.symvar(ca.vertcat(slopes, jets)), key=q.order)
+            values = np.linspace(0.5, 1.5, len(symbols)).round(2)
+            off = np.ravel(ca.Function("off", [ca.vertcat(*symbols)], [slopes])(values))
+            worst = int(np.argmax(np.abs(off)))
+            at = {s.name(): float(value) for s, value in zip(symbols, values, strict=True)}
+            raise SpecificationError(
+                f"The derivative of order {q.order(residual) - order} of the integral of {name!r} is not the residual: "
+                f"their difference has the slope {off[worst]:.4g} by {jets[worst].name()} at {str(at)[:300]}.",
+                "ψ = D^k F + ρ(t): what they differ by is a function of time alone.",
+                do=f"State another F, or leave {name!r} out of integrals and follow the plan by sv.lqr.",
+                name=name,
+                jet=jets[worst].name(),
+                slope=float(off[worst]),
+                at=at,
+            )
