@@ -50,6 +50,17 @@ def mass(poles, **stated):
     return plan, sv.computed(plan, sv.plant(body), rate=1000.0, poles={"jerk": poles})
 
 
+def jerk():
+    """The magnitude of the jerk is 2 m/s^3, in gravity, by two forces."""
+    q = sv.coordinates("x z")
+    p = sv.parameters(m=1.0, g=9.81, J=2.0)
+    place = ca.vertcat(*q)
+    forces = {"fx": q[0], "fz": q[1]}
+    body = sv.Mechanism(q, sv.particle(q, p.m, place), potential=p.m * p.g * q[1], actuators=forces, parameters=p)
+    start = {"x": 0.0, "z": 0.0, "dx": 1.0, "dz": 0.0, "d2x": 0.5, "d2z": 0.0}
+    return planned(body, sv.Program(sv.programs.jerk_norm("jerk", q, place, 2.0)), (0.0, 2.0), **start)
+
+
 def machine(plan, share=1.1):
     mechanism, masses = plan.model.reduction.mechanism, ("m", "m_load", "J", "I")
     values = dict(zip(mechanism.parameters.names, plan.model.parameters, strict=True))
@@ -125,6 +136,28 @@ def test_a_jerk_under_a_constant_force(stated):
         assert abs(loop.residual["jerk"][1, -1]) < 1e-6
     held = closed(sv.lqr(plan, sv.plant(plan.model.reduction.mechanism), rate=1000.0, integral={"jerk": 1e4}), disturbance={"x": 1.0})
     assert held.signal["integral of jerk"][-1] != 0 and abs(held.residual["jerk"][0, -1]) < 5e-3
+
+
+def test_a_constant_jerk_by_lqr():
+    """Its row, of the magnitude of the jerk, is no derivative of anything: LQR about the plan is the law."""
+    plan = jerk()
+    plant, loops = sv.plant(plan.model.reduction.mechanism), []
+    with refused(SpecificationError, "sv.lqr", name="jerk", order=3):
+        sv.computed(plan, plant)
+    for law in (sv.feedforward(plan, plant, rate=1000.0), sv.lqr(plan, plant, rate=1000.0), sv.lqr(plan, plant, rate=1000.0, integral={"x": 1e4, "z": 1e4})):
+        loops.append(closed(law))
+    places = [np.hypot(loop.error["x"], loop.error["z"])[-1] for loop in loops]
+    assert places[0] > 1.0 and places[1] < 2e-3 and places[2] < 0.1 * places[1]
+    assert np.abs(loops[1].residual["jerk"][0, 1000:]).max() < 0.25  # 10 % of 2 m/s^3: the plan's forces alone leave 0.35
+
+
+def test_an_ideal_plan_of_order_three_names_its_row():
+    scene = gallery["spiral"]
+    model = sv.derive(*scene.build())
+    plan = sv.simulate(model, model.start(**scene.start), (0.0, 0.5))
+    for law in (sv.computed, sv.lqr):
+        with refused(sv.errors.NotRealisable, "sv.lqr", 'by="actuators"', "'curvature'", names=("curvature",)):
+            law(plan, sv.plant(model.reduction.mechanism))
 
 
 def test_the_curvature_of_a_wheeled_robot():
@@ -224,6 +257,36 @@ def test_sums_stop_at_a_limit(spirals, curved):
     assert law.integrators == (3,) and law.state_names[3] == "integral of kappa"
 
 
+def test_sums_stop_at_a_limit_of_the_rate(spirals, curved):
+    """Forces that change by 0.3 N/s cannot follow either: the law knows them by what it commanded before."""
+    body, limits = spirals.model.reduction.mechanism, {"fx": 0.3, "fy": 0.3}
+    law = sv.computed(spirals, sv.plant(body, rate_limits=limits), rate=1000.0, poles={"kappa": SLOW, "speed": SLOW})
+    plant = sv.plant(body, m=1.1, rate_limits=limits)
+    loops = [closed(one, plant) for one in (law, curved)]
+    assert [abs(loop.signal["integral of kappa"][-1]) for loop in loops] == [pytest.approx(0, abs=1e-3), pytest.approx(2.3, rel=0.05)]
+    assert np.abs(loops[0].signal["fx before"][1:] - loops[0].inputs[0, :-1]).max() < 1e-12
+    assert abs(loops[0].residual["kappa"][0, -1]) < abs(loops[1].residual["kappa"][0, -1])
+    free = closed(sv.computed(spirals, sv.plant(body, rate_limits={"fx": 1e3}), rate=1000.0, poles={"kappa": SLOW, "speed": SLOW}))
+    assert np.abs(free["x"] - closed(curved)["x"]).max() < 1e-9
+
+
+def test_limited_allocates_among_what_is_fed_back(spirals, curved):
+    """F has the slack of its row: its sum is held meanwhile, and where limits are wide nothing changes."""
+    body = spirals.model.reduction.mechanism
+    heavy, wide, narrow = machine(spirals), sv.plant(body, limits={"fx": 9.0, "fy": 9.0}), sv.plant(body, limits={"fx": 1.0, "fy": 1.0})
+    assert np.array_equal(closed(sv.limited(curved, wide), heavy).commands, closed(curved, heavy).commands)
+    within = sv.plant(body, m=1.1, limits={"fx": 1.0, "fy": 1.0})
+    orders = (["speed", "kappa"], ["kappa", "speed"])
+    loops = [closed(sv.limited(curved, narrow, priority=order), within) for order in orders]
+    for loop in loops:
+        assert abs(loop.signal["integral of kappa"][-1]) < 0.03 and np.abs(loop.inputs).max() <= 1.0
+    slacks = [np.abs(loop.signal["slack speed"]).max() for loop in loops]
+    assert 0.1 < slacks[0] < 0.9 * slacks[1]
+    plan = jerk()
+    with refused(SpecificationError, "Leave out sv.limited", name="jerk", order=3):
+        sv.limited(sv.lqr(plan, sv.plant(plan.model.reduction.mechanism)), sv.plant(plan.model.reduction.mechanism, limits={"fx": 9.0}))
+
+
 # elsewhere -------------------------------------------------------------------------------------------------------
 
 
@@ -242,6 +305,17 @@ def test_in_lanes_and_in_python_control(curved):
     many = sv.close_many(loop, {"m": [1.0, 1.1, 1.2]}, record=["x", "fy"], every=10)
     assert np.abs(many.trace["x"][:, 1] - loop["x"][::10]).max() < 1e-12
     assert np.abs(many.trace["fy"][:, 1] - loop["fy"][::10]).max() < 1e-11
+    bounds = {"fx": 1.0, "fy": 1.0}
+    within = sv.plant(curved.plan.model.reduction.mechanism, m=1.1, limits=bounds, rate_limits=bounds)
+    aware = sv.computed(curved.plan, within, rate=1000.0, poles={"kappa": SLOW, "speed": SLOW})
+    plan, jerky = mass([-8.0, -10.0, -13.0])
+    held = sv.lqr(plan, sv.plant(plan.model.reduction.mechanism), rate=1000.0, integral={"jerk": 1e4})
+    for law, plant in ((aware, within), (sv.limited(curved, within), within), (jerky, machine(plan)), (held, machine(plan))):
+        loop, name = closed(law, plant), law.inputs[0]
+        heavier = sv.plant(plant.mechanism, m=1.2, limits=plant.limits, rate_limits=plant.rate_limits)
+        many, alone = sv.close_many(loop, {"m": [1.0, 1.2]}, record=["x", name]), closed(law, heavier)
+        assert np.abs(many.trace["x"][:, 1] - alone["x"]).max() < 1e-12 * max(np.abs(alone["x"]).max(), 1.0)
+        assert np.abs(many.trace[name][:, 1] - alone[name]).max() < 1e-11
     short = closed(curved, span=(0.0, 0.1))
     system = nlsys(short)
     found = control.input_output_response(system, short.t, np.zeros((system.ninputs, len(short.t))), start(short))

@@ -17,7 +17,7 @@ from servoctl.control.close import require_names
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, of_plan, require_plant
-from servoctl.control.residuals import Residuals, in_symbols_of, paths_along, program_residuals
+from servoctl.control.residuals import Residuals, as_read, in_symbols_of, paths_along, program_residuals
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest_along
@@ -251,13 +251,13 @@ def _predicted(reference, horizon, weights):
 def _at_once(reference, others):
     """Immediate effects of the inputs on residuals of order 2 along the plan, (N, m) by name; not of `others`."""
     plan, plant = reference.plan, reference.plant
-    program, q = program_residuals(plan.model), plan.model.reduction.mechanism.q
-    second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in others}
+    read, q = as_read(plan.model)[0], plan.model.reduction.mechanism.q
+    second = {name: e for name, e in in_symbols_of(plant, plan.model, read).items() if name not in others}
     for name in second:
-        if (order := q.order(program[name])) > 2:
+        if (order := q.order(read[name])) > 2:
             raise SpecificationError(
                 f"The residual {name!r} has order {order}.",
-                "Slack is given to residuals of order 2 at most, which the state and the inputs determine.",
+                "Slack is given to residuals, or F of which they are derivatives, that state and inputs determine.",
                 do="Leave out sv.limited; the plant limits the commands.",
                 name=name,
                 order=order,
