@@ -142,7 +142,7 @@ class Residuals:
             return [ca.vec(ca.densify(ca.jacobian(self.expressions, self._state)))]
 
         values = self._function("residual_jacobian", outputs).grid(t, x, self._p)
-        return values.reshape(-1, len(self.names), len(t)).transpose(2, 1, 0)
+        return values.reshape(self._state.numel(), len(self.names), len(t)).transpose(2, 1, 0)
 
 
 class Along:
