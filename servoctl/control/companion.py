@@ -83,18 +83,18 @@ class Sums:
 
     `counts` are the numbers of poles by row. `now` has the sums of each row, as they are fed back, SX columns. Where
     accelerations are in a row, its error is the mean over the last sample: (w_k - w_(k-1))/Ts with w = γ', at the state
-    in its middle. `limits` are the lowest and the highest input and its largest change, (m,) each, and `inputs` the
-    first ones by name. `state` are symbols of the controller state, `names` their names, `start` their first values,
-    `before` symbols of jets of references half a sample before, which are `jets`; `count` is the number of sums.
+    in its middle. `limits` are the lowest and the highest input and its largest change, (m,) each, and `first` (m,) the
+    inputs before the first command. `state` are symbols of the controller state, `names` their names, `start` its first
+    values, `before` symbols of jets of references half a sample before, which are `jets`; `count` is the number of sums.
     """
 
-    def __init__(self, extension, counts, period, limits, inputs):
+    def __init__(self, extension, counts, period, limits, first):
         q = self._q = extension.q
         self._period, self._limits = period, limits
         self._within, self._velocities = ca.SX.sym("within"), ca.SX.sym("w_before", q.n)
         numbers = {name: counts[name] - r for name, r in extension.orders.items()}
-        limited = any(numbers.values()) and np.isfinite(limits[-1]).any()
-        self._last = ca.SX.sym("u_before", len(inputs) * bool(limited))
+        limited = bool(any(numbers.values()) and np.isfinite(limits[-1]).any())
+        self._last = ca.SX.sym("u_before", len(first) * limited)
         rows = {name: row for name, row in extension.rows.items() if numbers[name] and q.order(row) == 2}
         self.jets = extension.jets(list(rows.values()))
         self.before = ca.SX.sym("before", len(self.jets))
@@ -108,12 +108,14 @@ class Sums:
                 now, step = now + ca.if_else(self._within, step, 0), 0 * step
             self.now.append(now)
             self._steps.append(step)
-        w, inside = extension.along[1][0][q.nq : q.nq + q.n], {"inputs within limits": (self._within, 0.0)}
-        held = inside | _before(q.velocity_names, self._velocities, w) if means else {}
-        held |= _before(inputs, self._last, inputs.values())
-        self.names, self.count = [*held, *sums], len(sums)
-        self.state = ca.vertcat(ca.SX(0, 1), *(symbol for symbol, _ in held.values()), *sums.values())
-        self.start = [*(value for _, value in held.values()), *np.zeros(len(sums))]
+        w, names = extension.along[1][0][q.nq : q.nq + q.n], q.velocity_names * bool(means) + extension.inputs * limited
+        self.names, self.count = (
+            [*["inputs within limits"] * bool(means), *(f"{n} before" for n in names), *sums],
+            len(sums),
+        )
+        symbols = [self._within, self._velocities] * bool(means) + [self._last]
+        self.state = ca.vertcat(ca.SX(0, 1), *symbols, *sums.values())
+        self.start = [*[0.0, *w] * bool(means), *list(first) * limited, *np.zeros(len(sums))]
         self._measured = [ca.vertcat(*q.gamma(1))] if means else []
 
     def _means(self, rows):
@@ -136,12 +138,6 @@ class Sums:
         held += [acting] if self._last.numel() else []
         sums = (now + ca.if_else(within, step, 0) for now, step in zip(self.now, self._steps, strict=True))
         return [*held, *sums]
-
-
-def _before(names, symbols, values):
-    """Symbols, and their first values, of what was measured or commanded a sample before, by name; none without."""
-    before = zip(names, symbols.elements(), values, strict=False)
-    return {f"{name} before": (symbol, value) for name, symbol, value in before}
 
 
 # --- chains of integrators and sums under sampled feedback

@@ -107,7 +107,7 @@ class _Extension:
     def __init__(self, plant, rows, points, along):
         e = plant.equations
         self.q, self.rows, self._paths = rows.q, rows.rows, rows.paths
-        q, self.powers, self.parameters = rows.q, rows.powers, plant.parameters
+        q, self.powers, self.parameters, self.inputs = rows.q, rows.powers, plant.parameters, plant.inputs
         self.t, self.x, self.names, self.points, self.along = q.t, e.state, tuple(rows.rows), points, along
         self.numbers = e.p[: e.p.numel() - e.u.numel() - q.n]
         undisturbed = [ca.substitute(part, e.d, ca.SX.zeros(q.n)) for part in (e.state_rates, e.acceleration)]
@@ -336,7 +336,7 @@ class _Extension:
         rest = iter(parts[3:])
         self.levels = [[next(rest) for _ in level] for level in self.levels]
 
-    def step(self, counts, limits, inputs):
+    def step(self, counts, limits, first):
         """The linearisation by a decoupling matrix of full rank: (t, [x; z], column) -> [u; z+].
 
         z is the controller state ξ and that of the `Sums`, to which the arguments are passed. The column is [plant's
@@ -345,7 +345,7 @@ class _Extension:
         """
         D, c = self.decoupling, [ca.SX.sym(f"c_{name}", n) for name, n in counts.items()]
         period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
-        sums = Sums(self, counts, period, limits, inputs)
+        sums = Sums(self, counts, period, limits, first)
         tops = [ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape)) for level in self.levels]
         chains = zip(c, sums.now, self.levels, strict=True)
         errors = [ca.dot(ci, ca.vertcat(*reversed(now.elements()), *level[:-1])) for ci, now, level in chains]
@@ -444,9 +444,9 @@ def computed(
         _require_slow(name, values, reference.rate, delay, degrees[name])
     coefficients = [np.poly(values).real[:0:-1] for values in poles.values()]
     state = linear.controller_states(*(values[:1] for values in linear.along))[0]
-    first = dict(zip(plant.inputs, reference.initial_input, strict=True))
     counts = {name: len(values) for name, values in poles.items()}
-    step, jets, sums = linear.step(counts, limits(plant, reference.period), first)
+    step, jets, sums = linear.step(counts, limits(plant, reference.period), reference.initial_input)
+    state = np.append(state, sums.start)
     before = sums.jets.at(reference.t - reference.period / 2)
     rows = zip(reference.ahead(delay).T, jets.at(reference.t).T, before.T, strict=True)
     columns = ([plant.parameters, [reference.period], u, *coefficients, r, b] for u, r, b in rows)
@@ -462,12 +462,12 @@ def computed(
         t0=float(plan.t[0]),
         step=step,
         schedule=np.column_stack([np.concatenate(column) for column in columns]),
-        state=np.append(state, sums.start),
+        state=state,
         state_names=(*linear.state_names, *sums.names),
         initial_input=reference.initial_input,
         plan=plan,
         info=info,
-        integrators=tuple(range(len(state) + len(sums.start))[len(state) + len(sums.start) - sums.count :]),
+        integrators=tuple(range(len(state) - sums.count, len(state))),
     )
 
 
