@@ -84,8 +84,9 @@ class Sums:
     `counts` are the numbers of poles by row. `now` has the sums of each row, as they are fed back, SX columns. Where
     accelerations are in a row, its error is the mean over the last sample: (w_k - w_(k-1))/Ts with w = γ', at the state
     in its middle. `limits` are the lowest and the highest input and its largest change, (m,) each, and `first` (m,) the
-    inputs before the first command. `state` are symbols of the controller state, `names` their names, `start` its first
-    values, `before` symbols of jets of references half a sample before, which are `jets`; `count` is the number of sums.
+    inputs before the first command. `state` are symbols of the controller state, `names` their names, `start` its
+    first values, `before` symbols of jets of references half a sample before, which are `jets`; `count` is the number
+    of sums.
     """
 
     def __init__(self, extension, counts, period, limits, first):
