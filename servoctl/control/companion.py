@@ -51,7 +51,8 @@ class Companion:
                     name=name,
                     t=float(t[lost][0]),
                 )
-        self.q, rows = plant.mechanism.q.beside(**dict.fromkeys(follow))[0], in_symbols_of(plant, model, read)
+        rows = in_symbols_of(plant, model, read)  # in symbols that `beside` shares
+        self.q = plant.mechanism.q.beside(**dict.fromkeys(follow))[0] if follow else plant.mechanism.q
         self.rows = rows | {name: rows[name] - self.q.family.jet(name + SUFFIX, 0) for name in powers}
         self.paths, self.powers = paths_along(model, plant) | follow, dict.fromkeys(rows, 0) | powers
 

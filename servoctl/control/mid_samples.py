@@ -6,7 +6,7 @@ a sample an acceleration is half a sample ahead of a plan that moves, and a resi
 
 import numpy as np
 
-from servoctl.control.residuals import known_residuals
+from servoctl.control.residuals import as_read, known_residuals
 
 WINDOW = 0.1  # s of a difference quotient: noise σ of F becomes √2 σ/H in the first, √6 σ/H² in the second
 
@@ -14,11 +14,12 @@ WINDOW = 0.1  # s of a difference quotient: noise σ of F becomes √2 σ/H in t
 def program_rows(run):
     """Residuals of the plan's program along a loop, (levels, N) by name; without those for which it is too short."""
     known, n = known_residuals(run.plan.model, run.plant), run.plant.mechanism.q.n
+    powers = as_read(run.plan.model)[1]
     rows = known.levels(run.t, np.vstack([run.states, np.zeros((n * (known.order - 1), len(run.t)))]))
     t, jets = _middles(run, known.order)
     at, along = known.levels(t, jets), known.along(run.plan, t)
     for name, order in zip(known.names, known.orders, strict=True):
-        k, edge = known.integrated.get(name, 0), (order > 2) * (order + 1) // 2
+        k, edge = powers.get(name, 0), (order > 2) * (order + 1) // 2
         if order > 1 or k:
             row = at[name][:, edge : len(t) - edge] - along.get(name, 0.0)
             row = np.vstack([row, quotient(row[0], k, run.loop.period)]) if k else row

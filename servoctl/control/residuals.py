@@ -20,6 +20,7 @@ class Residuals:
     A residual of order 3 or more, which is the k-th derivative of F and a function of time, is read by F. `names`
     selects some, and may name outputs of the mechanism and states: their residual, as that of F, is the deviation from
     the plan. `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations; None for all.
+    `rows` are residuals by name in place of the program's.
 
     Attributes
     ----------
@@ -38,18 +39,19 @@ class Residuals:
         The jets of references, which `expression` takes as numbers: laws have them in their schedule.
     planned : tuple of str
         Names of the residuals that are deviations from the plan.
-    integrated : dict of str to int
-        k by name of the residuals that are read by F.
+    integrated : dict of str to str
+        The rows, by name of the residuals, that are read by F.
     measures : tuple of str
         The states on which the residuals depend.
     """
 
-    def __init__(self, model, plant, names=None, order=1):
-        mechanism, (residuals, integrated) = model.reduction.mechanism, as_read(model)
-        q, planned, along, read = mechanism.q, _planned(mechanism), {}, dict(zip(residuals, residuals, strict=True))
+    def __init__(self, model, plant, names=None, order=1, rows=None):
+        mechanism = model.reduction.mechanism
+        residuals, powers = as_read(model) if rows is None else (rows, {})
+        q, planned, along, integrated = mechanism.q, _planned(mechanism), {}, {name: name for name in powers}
         if names is not None:  # which are signals, or else rows
             read = rows_read(residuals, mechanism.signals)
-            integrated = {name: integrated[row] for name, row in read.items() if row in integrated}
+            integrated = {name: row for name, row in read.items() if row in powers}
             along = {name: ca.SX.sym(f"plan {name}") for name in (*planned, *integrated) if name in names}
             rows = {name: residuals[row] for name, row in read.items()}
             valid = {name: q.order(e) for name, e in (rows | planned).items()}
@@ -80,12 +82,10 @@ class Residuals:
         self.symbols = [*(parameters[i] for i in self.places), *along.values(), *self.jets.symbols.elements()]
         self.parameters = np.append(plant.parameters[list(self.places)], np.zeros(len(along) + len(self.jets)))
         self.planned = tuple(along)
-        self.integrated = {name: k for name, k in integrated.items() if name in self.names}
-        self._rows = {name: read[name] for name in self.integrated}
+        self.integrated = {name: row for name, row in integrated.items() if name in self.names}
         states = zip(plant.state_names, self._state.elements(), strict=True)
         self._measured = {name: s for name, s in states if ca.depends_on(self.expressions, s)}
-        self.measures = tuple(self._measured)
-        self._built = {}
+        self.measures, self._built = tuple(self._measured), {}
 
     def expression(self, t, y, measures, p):
         """φ as an SX column of the symbols t, y (named by `measures`) and p."""
@@ -133,7 +133,7 @@ class Residuals:
     def along(self, plan, t):
         """F along a plan by name, (N,) each."""
         read = as_read(plan.model)[0]
-        return {name: Along(plan, read[row]).jets(t, 0)[0, 0] for name, row in self._rows.items()}
+        return {name: Along(plan, read[row]).jets(t, 0)[0, 0] for name, row in self.integrated.items()}
 
     def jacobian(self, t, x):
         """∂φ/∂x along states of the plant, (N, k, n_x)."""

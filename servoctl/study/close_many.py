@@ -156,8 +156,8 @@ def _unit(run):
 @lru_cache(32)
 def _residuals_of_state(model, plant):
     """The residuals of a program that are functions of the state; None if there are none."""
-    order = model.reduction.mechanism.q.order
-    residuals = Residuals(model, plant, [name for name, e in program_residuals(model).items() if order(e) <= 1])
+    order, rows = model.reduction.mechanism.q.order, program_residuals(model)
+    residuals = Residuals(model, plant, rows={name: e for name, e in rows.items() if order(e) <= 1})
     return residuals if residuals.names else None
 
 
