@@ -163,9 +163,10 @@ class Along:
         symbols, jets = ca.vertcat(*(q.jet(i) for i in range(q.order(levels) + 1))), Jets(q, [levels], model.paths)
         t, places = np.unique(np.clip(t, *plan.span), return_inverse=True)
         z, size = plan.at(t), symbols.numel()
-        z = z[:size] if len(z) >= size else extended(model, t, z, size)
+        if len(z) < size:
+            z = np.hstack([extended(one, t[inside], z[:, inside], size) for one, inside in plan.by_model(t)])
         f = ca.Function("along", [q.t, symbols, p, jets.symbols], [levels])
-        return np.array(f(t[None], z, model.parameters, jets.at(t)))[:, None, places]
+        return np.array(f(t[None], z[:size], model.parameters, jets.at(t)))[:, None, places]
 
 
 def paths_along(model, plant):
