@@ -74,7 +74,8 @@ def without_errors(plan):
         functions = model._functions | functions
         return Model(model.reduction, model._store, model.parameters, functions, paths=model.paths)
 
-    models = {id(piece.model): held(piece.model) for piece in plan.steps} | {id(plan.model): held(plan.model)}
+    models = {id(model): model for model in (plan.model, *(piece.model for piece in plan.steps))}
+    models = {key: held(model) for key, model in models.items()}
     steps = tuple(replace(piece, model=models[id(piece.model)]) for piece in plan.steps)
     return replace(plan, model=models[id(plan.model)], steps=steps)
 
@@ -111,14 +112,11 @@ class Sums:
             self.now.append(now)
             self._steps.append(step)
         w, names = extension.along[1][0][q.nq : q.nq + q.n], q.velocity_names * bool(means) + extension.inputs * limited
-        self.names, self.count = (
-            [*["inputs within limits"] * bool(means), *(f"{n} before" for n in names), *sums],
-            len(sums),
-        )
+        self.names = [*["inputs within limits"] * bool(means), *(f"{name} before" for name in names), *sums]
         symbols = [self._within, self._velocities] * bool(means) + [self._last]
         self.state = ca.vertcat(ca.SX(0, 1), *symbols, *sums.values())
         self.start = [*[0.0, *w] * bool(means), *list(first) * limited, *np.zeros(len(sums))]
-        self._measured = [ca.vertcat(*q.gamma(1))] if means else []
+        self._measured, self._limited, self.count = bool(means), limited, len(sums)
 
     def _means(self, rows):
         """Rows by name with the mean accelerations of the last sample, at the state in its middle."""
@@ -133,11 +131,10 @@ class Sums:
         """The next state: sums of errors are held while a command (m,) exceeds limits of size or of change."""
         low, high, change = np.nan_to_num(self._limits)  # the largest doubles in place of infinity
         acting = ca.fmin(ca.fmax(command, low), high)
-        if self._last.numel():
+        if self._limited:
             acting = ca.fmin(ca.fmax(acting, self._last - change), self._last + change)
         within = ca.sum1(ca.fabs(acting - command)) == 0
-        held = [within, *self._measured] if self._measured else []
-        held += [acting] if self._last.numel() else []
+        held = [within, ca.vertcat(*self._q.gamma(1))] * self._measured + [acting] * self._limited
         sums = (now + ca.if_else(within, step, 0) for now, step in zip(self.now, self._steps, strict=True))
         return [*held, *sums]
 

@@ -118,8 +118,8 @@ class _Extension:
         self.turns = False  # whether the rows that see some inputs change along the plan
         jets = ca.vertcat(*q.gamma(2))
         self.levels = [[ca.substitute(ca.SX(row), jets, acceleration)] for row in self.rows.values()]
-        self._require_affine()
-        for level in self.levels:
+        for name, level in zip(self.names, self.levels, strict=True):
+            self._require_affine(name, level[0])
             self._differentiate(level)
         self.relative_degree = self.orders
 
@@ -137,17 +137,16 @@ class _Extension:
         by_model = {name: k > 0 and self.q.order(self.rows[name]) > 1 for name, k in self.powers.items()}
         return {name: max(self.powers[name], r + (r > 0 and by_model[name]), 1) for name, r in self.orders.items()}
 
-    def _require_affine(self):
-        """Refuse rows whose accelerations do not enter in proportion."""
-        for name, (first, *_) in zip(self.names, self.levels, strict=True):
-            bent = ca.jacobian(ca.vec(ca.jacobian(first, self.v)), self.v).nonzeros()
-            if bent and not vanish(spread(bent)).all():
-                raise SpecificationError(
-                    f"Accelerations do not enter {name!r} in proportion.",
-                    "What is fed back by accelerations is solved for the inputs, once and for all.",
-                    do="Use sv.lqr, which follows plans of any program.",
-                    name=name,
-                )
+    def _require_affine(self, name, row):
+        """Refuse a row whose accelerations do not enter in proportion."""
+        bent = ca.hessian(row, self.v)[0].nonzeros()
+        if bent and not vanish(spread(bent)).all():
+            raise SpecificationError(
+                f"Accelerations do not enter {name!r} in proportion.",
+                "What is fed back by accelerations is solved for the inputs, once and for all.",
+                do="Use sv.lqr, which follows plans of any program.",
+                name=name,
+            )
 
     def require_rank(self):
         """Refuse a decoupling that loses its rank somewhere along the plan, for rows that are fed back by F."""
