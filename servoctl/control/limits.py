@@ -92,8 +92,9 @@ def limited(
     For residuals of order 2, w_i times the square of their immediate change is added. With a priority the weights fall
     by 1e-4 from one residual to the next; the choice is made sample by sample, and a residual of high priority is not
     always smaller over a whole motion. The slack of a residual is its deviation after the horizon if the difference is
-    held (for residuals of order 2, its immediate deviation). While there is slack, integrals of residuals in the
-    controller state are held (anti-windup). An estimator predicts with the inputs that act.
+    held (for residuals of order 2, its immediate deviation); of a residual of order 3 or more it is that of F. While
+    there is slack, integrals of residuals in the controller state are held (anti-windup). An estimator predicts with
+    the inputs that act.
 
     Parameters
     ----------
