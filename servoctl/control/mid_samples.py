@@ -30,10 +30,7 @@ def program_rows(run):
 
 
 def _middles(run, order):
-    """Instants (N - 1,) and the jets up to γ^(order) there.
-
-    States by polynomials through states and rates, accelerations of the plant, and differences of the velocities.
-    """
+    """Middles (N - 1,), and jets there: by polynomials, by the plant, from order 3 on by differences of velocities."""
     plant, x, h, t = run.plant, run.states, run.loop.period, run.t[:-1] + run.loop.period / 2
     nq, n, (start, middle, end) = plant.mechanism.q.nq, plant.mechanism.q.n, (run.p_within(i)[:, :-1] for i in range(3))
     ode = plant.function("ode")

@@ -286,7 +286,7 @@ def require_parts(mechanism, program, guess):
     for name, expression in program.residuals.items():
         require_known(expression, mechanism, f"the residual {name!r}")
     chosen = {"weight": program.weights, "wish": program.toward}
-    for what, values in (chosen | {"integral": program.stated}).items():
+    for what, values in (chosen | {"integral": program.integrals}).items():
         for name, expression in values.items():
             require_known(ca.SX(expression), mechanism, f"the {what} of {name!r}")
     twice = [name for name in program.residuals if name in mechanism.constraints]

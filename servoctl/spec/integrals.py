@@ -12,7 +12,7 @@ def integrals(q, program):
     found = {}
     for name, residual in program.residuals.items():
         order = q.order(residual)
-        F = (program.stated if order <= 2 else program.integrals | program.stated).get(name)
+        F = program.integrals.get(name) if order > 2 or name in program.stated else None
         if F is not None and 0 <= q.order(F) <= min(2, order - 1) and not _left(q, residual, F):
             found[name] = F
     return found
@@ -30,7 +30,7 @@ def _left(q, residual, F):
 
 def require_integrals(q, program):
     """Refuse stated integrals that are of no order below their residual's, up to 2, or do not give it."""
-    for name, F in program.stated.items():
+    for name, F in ((name, program.integrals[name]) for name in program.stated):
         residual, order = program.residuals[name], q.order(F)
         if not 0 <= order <= min(2, q.order(residual) - 1):
             raise SpecificationError(

@@ -75,9 +75,10 @@ class Program(Packed):
         weights = None if self.metric == "inertia" else weights
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
         self.toward = {name: _wish(name, value) for name, value in mapping(toward, "The wishes").items()}
-        self.integrals = {name: value.of for name, value in residuals.items() if isinstance(value, Rate)}
+        found = {name: value.of for name, value in residuals.items() if isinstance(value, Rate)}
         given = by_name(mapping(integrals, "The integrals"), self.residuals, "residual", "The integrals")
-        self.stated = {name: column(value, f"The integral of {name!r}", 1)[0] for name, value in given.items()}
+        given = {name: column(value, f"The integral of {name!r}", 1)[0] for name, value in given.items()}
+        self.integrals, self.stated = found | given, tuple(given)
 
     def __eq__(self, other):
         """Whether names, choices and expressions in symbols of the same names are the same."""
@@ -90,7 +91,7 @@ class Program(Packed):
 
     def _facts(self):
         """Names, choices, symbols' names and expressions as text."""
-        parts = (self.with_turns, self.weights, self.toward, self.integrals, self.stated)
+        parts = (self.with_turns, self.weights, self.toward, self.integrals)
         expressions = [ca.SX(value) for part in parts for value in part.values()]
         symbols = ca.symvar(ca.vertcat(*expressions))
         text = ca.Function("program", symbols, expressions).serialize()
@@ -178,12 +179,8 @@ class Program(Packed):
                 coordinates=list(q.names),
             )
         symbols, values = [q.t], [instant + (q.t - instant) / sigma]
-        parts = (
-            self.with_turns,
-            {name: ca.SX(value) for name, value in self.weights.items()},
-            self.integrals,
-            self.stated,
-        )
+        weights = {name: ca.SX(value) for name, value in self.weights.items()}
+        parts = (self.with_turns, weights, self.integrals)
         every = [value for part in parts for value in part.values()]
         for k in range(1, max(map(q.order, every)) + 1):
             symbols += q.gamma(k)
@@ -193,13 +190,12 @@ class Program(Packed):
             if place and place[0] == "r" and place[1]:
                 symbols, values = [*symbols, symbol], [*values, sigma ** place[1] * symbol]
         slower = iter(ca.substitute(every, symbols, values))
-        residuals, weights, *integrals = ({name: next(slower) for name in part} for part in parts)
+        residuals, weights, integrals = ({name: next(slower) for name in part} for part in parts)
         toward = {name: ca.substitute(ca.SX(wish), q.t, values[0]) for name, wish in self.toward.items()}
         program = self.again(residuals, weights, toward)
-        program.integrals, program.stated = (
-            {name: sigma ** (q.order(residuals[name]) - q.order(F)) * F for name, F in part.items()}
-            for part in integrals
-        )
+        program.integrals = {
+            name: sigma ** (q.order(residuals[name]) - q.order(F)) * F for name, F in integrals.items()
+        }
         return program
 
     def again(self, residuals, weights, toward):
@@ -223,7 +219,7 @@ def no_program(jumps=False):
     """The program without residuals: forces alone determine the motion, and may jump if so."""
     program = object.__new__(Program)
     program.by, program.residuals, program.with_turns, program.weights, program.toward = "actuators", {}, {}, {}, {}
-    program.metric, program.jumps, program.integrals, program.stated = "actuators", jumps, {}, {}
+    program.metric, program.jumps, program.integrals, program.stated = "actuators", jumps, {}, ()
     return program
 
 
