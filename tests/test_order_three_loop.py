@@ -287,6 +287,17 @@ def test_limited_allocates_among_what_is_fed_back(spirals, curved):
         sv.limited(sv.lqr(plan, sv.plant(plan.model.reduction.mechanism)), sv.plant(plan.model.reduction.mechanism, limits={"fx": 9.0}))
 
 
+def test_limited_needs_no_row_of_the_state():
+    """Where all rows have order 2, slack is that of their accelerations."""
+    body, _ = particle()
+    ax, ay = body.q.d(2)
+    plan = planned(body, sv.Program({"a": ax - 1.0, "b": ay - 0.5}), (0.0, 1.0), x=0.0, y=0.0, dx=0.0, dy=0.0)
+    law = sv.limited(sv.lqr(plan, sv.plant(body)), sv.plant(body, limits={"fx": 1.02}))
+    loop = closed(law)
+    assert loop["fx"].max() <= 1.02 and loop.signal["slack a"].min() < -1.0 and np.abs(loop.signal["slack b"]).max() < 1e-9
+    assert abs(loop.residual["a"][0, -1]) == pytest.approx(1 - 1.02 / 1.1, rel=1e-6)
+
+
 # elsewhere -------------------------------------------------------------------------------------------------------
 
 
