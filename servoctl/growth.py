@@ -223,7 +223,7 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
     tried, shorter ones where the linearisation is large.
     """
     model = require_run(run, "internal_dynamics")
-    if model.flat:
+    if model.flat or not _dimension(model):
         return InternalDynamics(Tangents((), run.t[:0], np.ones(0), *np.zeros((2, 0, 0, 0))), "none", 1.0)
     t0, t1 = run.span
     if not run.resolved:

@@ -168,7 +168,7 @@ def closed_loops_stay_near_their_plans(result):
 
 def closed_loops_show_what_computed_actuation_cannot_do(result):
     """A curvature says nothing of the place; and the upright pendubot's eigenvalue is that of its linearisation."""
-    assert result["wheeled robot: computed last"] > 5 * result["wheeled robot: worst"]
+    assert result["wheeled robot: computed last"] > 5 * result["wheeled robot: last"]
     inertia, torque, damping = 0.07 + 3.0 * 0.25**2, 3.0 * 9.81 * 0.25, 0.05  # of the second link about the elbow
     assert result["pendubot: eigenvalue"] == pytest.approx(max(np.roots([inertia, damping, -torque])), rel=1e-4)
 

@@ -88,7 +88,8 @@ def affine(name, reference, K, K_i=None, residuals=None, info=None):
 def integration(reference, residuals):
     """The schedule of z+ = z + Ts φ: Ts, the parameters of φ and what is planned at each sample, (1 + n_p, N)."""
     constant = np.append(reference.period, residuals.parameters[: len(residuals.places)])
-    planned = [reference.planned(name) for name in residuals.planned]
+    along = residuals.along(reference.plan, reference.t)
+    planned = [along[name] if name in along else reference.planned(name) for name in residuals.planned]
     return np.vstack([np.tile(constant[:, None], len(reference.t)), *planned, residuals.jets.at(reference.t)])
 
 

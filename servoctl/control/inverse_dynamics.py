@@ -4,7 +4,7 @@ A residual is differentiated along the plant until an input appears, φ^(r) = b 
 rank ρ < k, regular feedback makes ρ of these derivatives inputs. Those on which the other rows depend get an integrator
 and become controller states, and the others are differentiated further: the dynamic extension algorithm of Descusse and
 Moog. Where these rows change along the plan, as on a full turn of a vehicle, inputs get the integrators instead. Ranks
-are decided by numbers, at states about a plan.
+are decided by numbers, at states about a plan. Rows of order 3 and more are fed back by F (`companion`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,15 +13,16 @@ import casadi as ca
 import numpy as np
 
 from servoctl.checks import as_complex, by_name, is_number, positive, whole
+from servoctl.control.companion import Companion, Sums, fastest_poles, sampled_radius, without_errors
+from servoctl.control.conditions import limits
 from servoctl.control.feedback import law_step
 from servoctl.control.law import Law
 from servoctl.control.reference import Reference, of_plan, refuse_transport
-from servoctl.control.residuals import in_symbols_of, paths_along
-from servoctl.control.sampling import sampled_radii
+from servoctl.control.residuals import in_symbols_of
 from servoctl.errors import NotRealisable, SpecificationError, UnstableInternalDynamics
 from servoctl.growth import internal_dynamics
+from servoctl.jets.identity import spread, vanish
 from servoctl.jets.tape import Tape, evaluate
-from servoctl.methods.stability import sampled_bound
 from servoctl.plants.plant import Plant
 from servoctl.reduction.ranks import clean, decide, decide_all, eliminate
 from servoctl.reduction.realisation import desired_actuation
@@ -33,21 +34,19 @@ WEAK = 0.05  # of its largest size along the plan: a smaller determinant is no c
 LEVEL_STEPS = 12  # Newton steps for the controller states on the plan
 RANK_POINTS, AWAY, SEED = 8, 0.02, 20240229  # states for the ranks, and their distance from the plan
 SHARE = 1e-9  # of the largest entry, in rows and columns of like size: smaller ones are rounding
+RANK_LOST = 1e-6  # of the largest smallest singular value along the plan: below it the rank is lost
 MOST_DELAY = 1000  # samples: the poles of a delayed loop are eigenvalues of a matrix of that size
 MOST_DERIVATIVES = 4  # of the number of states: derivatives of a residual until an input appears
 TIME_CONSTANT = 0.25  # s: several poles there rise in about a second, as suits cranes and arms of human size
 
 
-def linearise(plan, plant):
+def linearise(plan, plant, rows):
     """The extension that a plant needs for exact linearisation of a program; ranks are decided about the plan's states.
 
-    Refuses residuals of an order above 2, a plant of another mechanism, and residuals that depend on no input.
+    `rows` is the program's `Companion`. Refuses residuals that depend on no input, or not in proportion.
     """
-    _require_invertible(plan.model.reduction, plant)
     along = np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS)
-    points = _points(plan, plant), (along, _plant_states(plan, plant, along))
-    residuals, paths = in_symbols_of(plant, plan.model), paths_along(plan.model, plant)
-    extension = _Extension(plant, residuals, paths, *points)
+    extension = _Extension(plant, rows, _points(plan, plant), (along, _plant_states(plan, plant, along)))
     reduction = plan.model.reduction
     split, wish = reduction.realisation.actuation, desired_actuation(reduction.mechanism, reduction.program)
     if split.shape[0] > split.shape[1] and reduction.mechanism.q.order(split) < 2:
@@ -56,11 +55,12 @@ def linearise(plan, plant):
         extension.share(**in_symbols_of(plant, plan.model, parts))
     while extension.rank() < len(extension.names):
         extension.extend()
+    extension.require_rank()
     return extension
 
 
 def _require_invertible(reduction, plant):
-    """Refuse a plant of another mechanism, and residuals of an order above 2."""
+    """Refuse a plant of another mechanism."""
     if plant.mechanism != reduction.mechanism:
         raise SpecificationError(
             "The plant and the plan have different mechanisms.",
@@ -69,15 +69,6 @@ def _require_invertible(reduction, plant):
             plant=plant.mechanism.q.names,
             plan=reduction.mechanism.q.names,
         )
-    for name, residual in reduction.program.residuals.items():
-        if (order := reduction.mechanism.q.order(residual)) > 2:
-            raise SpecificationError(
-                f"The residual {name!r} has order {order}.",
-                "The plant's state and inputs determine derivatives up to γ''.",
-                do="Use sv.lqr, which follows plans of any order.",
-                name=name,
-                order=order,
-            )
 
 
 def _points(plan, plant):
@@ -113,11 +104,11 @@ class _Extension:
     `relative_degree` are the orders of the residuals without the extension.
     """
 
-    def __init__(self, plant, residuals, paths, points, along):
+    def __init__(self, plant, rows, points, along):
         e = plant.equations
-        self.q = q = e.q
-        self.parameters, self._paths = plant.parameters, paths
-        self.t, self.x, self.names, self.points, self.along = q.t, e.state, tuple(residuals), points, along
+        self.q, self.rows, self._paths = rows.q, rows.rows, rows.paths
+        q, self.powers, self.parameters, self.inputs = rows.q, rows.powers, plant.parameters, plant.inputs
+        self.t, self.x, self.names, self.points, self.along = q.t, e.state, tuple(rows.rows), points, along
         self.numbers = e.p[: e.p.numel() - e.u.numel() - q.n]
         undisturbed = [ca.substitute(part, e.d, ca.SX.zeros(q.n)) for part in (e.state_rates, e.acceleration)]
         self.x_rate, acceleration = undisturbed
@@ -126,8 +117,9 @@ class _Extension:
         self.weights = None  # of inputs that share at the end
         self.turns = False  # whether the rows that see some inputs change along the plan
         jets = ca.vertcat(*q.gamma(2))
-        self.levels = [[ca.substitute(ca.SX(residual), jets, acceleration)] for residual in residuals.values()]
-        for level in self.levels:
+        self.levels = [[ca.substitute(ca.SX(row), jets, acceleration)] for row in self.rows.values()]
+        for name, level in zip(self.names, self.levels, strict=True):
+            self._require_affine(name, level[0])
             self._differentiate(level)
         self.relative_degree = self.orders
 
@@ -135,6 +127,43 @@ class _Extension:
     def orders(self):
         """Orders of the error dynamics by residual: their relative degrees with the extension so far."""
         return {name: len(level) - 1 for name, level in zip(self.names, self.levels, strict=True)}
+
+    @property
+    def needed(self):
+        """The least numbers of poles by residual: its relative degree, or the k of a row ψ = D^k F, at least one.
+
+        Behind integrators or lags an F with accelerations is known by the model alone; one pole more measures it.
+        """
+        by_model = {name: k > 0 and self.q.order(self.rows[name]) > 1 for name, k in self.powers.items()}
+        return {name: max(self.powers[name], r + (r > 0 and by_model[name]), 1) for name, r in self.orders.items()}
+
+    def _require_affine(self, name, row):
+        """Refuse a row whose accelerations do not enter in proportion."""
+        bent = ca.hessian(row, self.v)[0].nonzeros()
+        if bent and not vanish(spread(bent)).all():
+            raise SpecificationError(
+                f"Accelerations do not enter {name!r} in proportion.",
+                "What is fed back by accelerations is solved for the inputs, once and for all.",
+                do="Use sv.lqr, which follows plans of any program.",
+                name=name,
+            )
+
+    def require_rank(self):
+        """Refuse a decoupling that loses its rank somewhere along the plan, for rows that are fed back by F."""
+        if not any(self.powers.values()):
+            return
+        times, states = self.along
+        values = self._at(self.decoupling, times, states, self.controller_states(times, states))[0]
+        sizes = np.linalg.svd(np.moveaxis(_without_units(values).astype(float), 2, 0), compute_uv=False)[:, -1]
+        k = int(np.argmin(sizes))
+        if not sizes[k] > RANK_LOST * sizes.max():
+            raise SpecificationError(
+                f"The inputs do not reach {', '.join(self.names)} one by one at t = {times[k]:.6g} s of the plan.",
+                "The decoupling matrix of what is fed back has full rank along the whole plan.",
+                do="Use sv.lqr, which follows plans of any program, or keep the plan off this place.",
+                names=self.names,
+                t=float(times[k]),
+            )
 
     def _rate(self, expression):
         """The total derivative along the extended plant."""
@@ -306,21 +335,27 @@ class _Extension:
         rest = iter(parts[3:])
         self.levels = [[next(rest) for _ in level] for level in self.levels]
 
-    def step(self):
-        """The linearisation by a decoupling matrix of full rank: (t, [x; ξ], column) -> [u; ξ+]; jets of references.
+    def step(self, counts, limits, first):
+        """The linearisation by a decoupling matrix of full rank: (t, [x; z], column) -> [u; z+].
 
-        The column is [plant's parameters; Ts; increment of u; coefficients of the error dynamics; these jets].
+        z is the controller state ξ and that of the `Sums`, to which the arguments are passed. The column is [plant's
+        parameters; Ts; increment of u; coefficients of the error dynamics; jets of references; their jets half a sample
+        before]. Returns the step, the former jets and the sums.
         """
-        D, c = self.decoupling, [ca.SX.sym(f"c_{name}", order) for name, order in self.orders.items()]
+        D, c = self.decoupling, [ca.SX.sym(f"c_{name}", n) for name, n in counts.items()]
+        period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
+        sums = Sums(self, counts, period, limits, first)
         tops = [ca.substitute(level[-1], self.v, ca.SX.zeros(self.v.shape)) for level in self.levels]
-        errors = (ca.dot(ci, ca.vertcat(*level[:-1])) for ci, level in zip(c, self.levels, strict=True))
+        chains = zip(c, sums.now, self.levels, strict=True)
+        errors = [ca.dot(ci, ca.vertcat(*reversed(now.elements()), *level[:-1])) for ci, now, level in chains]
         target = -ca.vertcat(*(top + error for top, error in zip(tops, errors, strict=True)))
         self._substitute(self.v, self._solved(D, target))
-        period, ahead = ca.SX.sym("Ts"), ca.SX.sym("ahead", self.u.numel())
-        outputs = [self.u + ahead, self._advanced(period)]
+        command = self.u + ahead
+        outputs = [command, self._advanced(period), *sums.after(command)]
         jets = self.jets(outputs)
-        column = ca.vertcat(self.numbers, period, ahead, *c, jets.symbols)
-        return law_step("computed", self.t, ca.vertcat(self.x, self.xi), column, outputs), jets
+        column = ca.vertcat(self.numbers, period, ahead, *c, jets.symbols, sums.before)
+        state = ca.vertcat(self.x, self.xi, sums.state)
+        return law_step("computed", self.t, state, column, outputs), jets, sums
 
     def _solved(self, D, target):
         """v with D v = target: the only one, or the one of least norm, of the inputs if they still have to share."""
@@ -358,8 +393,10 @@ def computed(
     """Inverse dynamics at the measured state, with error dynamics by poles.
 
     Each residual obeys Π(D - λ_i) φ = 0 if the machine is the plant: φ is differentiated along the plant until the
-    inputs decouple, with dynamic extension if their decoupling matrix is singular. The command is held from `delay`
-    samples after the measurement on; the change of the plan's actuation until the middle of the hold is added.
+    inputs decouple, with dynamic extension if their decoupling matrix is singular. A residual of order 3 or more is the
+    k-th derivative of some F, and F minus F along the plan is in its place. Where accelerations are in what is fed
+    back, they are the differences of measured velocities. The command is held from `delay` samples after the
+    measurement on; the change of the plan's actuation until the middle of the hold is added.
 
     Parameters
     ----------
@@ -371,7 +408,8 @@ def computed(
         Samples per second [Hz].
     poles : float or dict of str to sequence of complex, optional
         One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] by residual, as many as its
-        relative degree with the extension (`law.info["orders"]`).
+        relative degree with the extension, or as k, at least one (`law.info["orders"]`), or one more. As far as they
+        are more than the relative degree, sums of errors are fed back, which stop while an actuator is at its limit.
     delay : int
         Delay of the loop in samples, for which the poles are checked.
 
@@ -384,7 +422,8 @@ def computed(
     UnstableInternalDynamics
         If the internal dynamics are unstable along the plan: linearisation would hide them, not stabilise them.
     SpecificationError
-        If the sampled error dynamics are unstable, the number of poles is wrong, or a path is not smooth enough: the
+        If the sampled error dynamics are unstable, the number of poles is wrong, a residual of order 3 or more has no
+        F, what is fed back has no value or no rank somewhere along the plan, or a path is not smooth enough: the
         command of a lagging actuator needs one derivative more than the plan's actuation.
     NotRealisable
         If a residual depends on no input.
@@ -393,19 +432,27 @@ def computed(
     reference = Reference(plan, plant, rate)
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
-    _require_stable(plan)
-    linear = linearise(plan, plant)
-    _require_smooth(plan, linear.orders)
-    poles = _poles(poles, linear.orders)
+    _require_invertible(plan.model.reduction, plant)
+    rows = Companion(plan, plant, np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS))
+    _require_stable(without_errors(plan) if any(rows.powers.values()) else plan)
+    linear = linearise(plan, plant, rows)
+    _require_smooth(plan, linear)
+    orders, degrees = linear.needed, linear.orders
+    poles = _poles(poles, orders)
     for name, values in poles.items():
-        _require_slow(name, values, reference.rate, delay)
-    coefficients = [np.poly(values).real[:0:-1] for values in poles.values() if len(values)]
+        _require_slow(name, values, reference.rate, delay, degrees[name])
+    coefficients = [np.poly(values).real[:0:-1] for values in poles.values()]
     state = linear.controller_states(*(values[:1] for values in linear.along))[0]
-    step, jets = linear.step()
-    rows = zip(reference.ahead(delay).T, jets.at(reference.t).T, strict=True)
-    columns = ([plant.parameters, [reference.period], u, *coefficients, r] for u, r in rows)
-    info = {"orders": linear.orders, "relative degree": linear.relative_degree, "poles": poles}
-    info["error dynamics"] = ", ".join(f"{name} of order {order}" for name, order in linear.orders.items())
+    counts = {name: len(values) for name, values in poles.items()}
+    step, jets, sums = linear.step(counts, limits(plant, reference.period), reference.initial_input)
+    state = np.append(state, sums.start)
+    before = sums.jets.at(reference.t - reference.period / 2)
+    rows = zip(reference.ahead(delay).T, jets.at(reference.t).T, before.T, strict=True)
+    columns = ([plant.parameters, [reference.period], u, *coefficients, r, b] for u, r, b in rows)
+    info = {"orders": orders, "relative degree": linear.relative_degree, "poles": poles}
+    info["error dynamics"] = ", ".join(f"{name} of order {len(values)}" for name, values in poles.items())
+    if free := plant.n_x + linear.xi.numel() - sum(degrees.values()):
+        info["free"] = f"{free} of {plant.n_x + linear.xi.numel()} states are not fed back: they are free to drift"
     return Law(
         name="computed",
         measures=plant.state_names,
@@ -415,19 +462,20 @@ def computed(
         step=step,
         schedule=np.column_stack([np.concatenate(column) for column in columns]),
         state=state,
-        state_names=tuple(linear.state_names),
+        state_names=(*linear.state_names, *sums.names),
         initial_input=reference.initial_input,
         plan=plan,
         info=info,
+        integrators=tuple(range(len(state) - sums.count, len(state))),
     )
 
 
-def _require_smooth(plan, orders):
+def _require_smooth(plan, linear):
     """Refuse paths with fewer derivatives than the error dynamics need."""
     reduction, q = plan.model.reduction, plan.model.reduction.mechanism.q
     for name, residual in reduction.program.residuals.items():
         for reference, k in Jets(q, [residual]).places:
-            _require_class(plan, name, orders.get(name, 0) + k, reference)
+            _require_class(plan, name, max(linear.orders[name] - linear.powers[name], 0) + k, reference)
 
 
 def _require_class(plan, name, order, reference):
@@ -482,10 +530,10 @@ def _poles(poles, orders):
     poles, by_residual = by_name(poles, orders, "residual", "The poles"), {}
     for name, order in orders.items():
         values = as_complex(poles.get(name, ()))
-        if values.shape != (order,) or not np.isfinite(values).all() or not _paired(values):
+        if values.shape not in ((order,), (order + 1,)) or not np.isfinite(values).all() or not _paired(values):
             raise SpecificationError(
                 f"The poles of {name!r} are {poles.get(name)!r}.",
-                f"Its error dynamics have order {order} and as many poles, complex ones in conjugate pairs.",
+                f"Its error dynamics have order {order} and as many poles, or one more; complex ones in pairs.",
                 do=f"Pass {order}, as {[-4.0] * order}.",
                 name=name,
                 order=order,
@@ -499,8 +547,8 @@ def _paired(poles):
     return np.allclose(np.sort_complex(poles), np.sort_complex(poles.conj()), rtol=1e-9, atol=0)
 
 
-def _require_slow(name, poles, rate, delay):
-    """Refuse poles whose error dynamics are unstable under a zero-order hold."""
+def _require_slow(name, poles, rate, delay, degree):
+    """Refuse poles whose error dynamics, of a relative degree, are unstable under a zero-order hold."""
     order = len(poles)
     if np.any(poles.real >= 0):
         mirrored = -np.abs(poles.real) + 1j * poles.imag
@@ -512,9 +560,9 @@ def _require_slow(name, poles, rate, delay):
             name=name,
             poles=poles,
         )
-    radius = sampled_radius(poles, rate, delay) if order else 0.0
+    radius = sampled_radius(poles, rate, delay, degree)
     if not radius < 1.0:
-        fastest, bound = float(np.abs(poles).max()), sampled_bound(order, delay)
+        fastest, bound = float(np.abs(poles).max()), fastest_poles(order, degree, delay)
         late = f" with {delay} samples of delay" if delay else ""
         raise SpecificationError(
             f"The fastest pole of {name!r}, {fastest:.4g} 1/s, is sampled at {rate:g} Hz{late}: |p| Ts = "
@@ -528,10 +576,3 @@ def _require_slow(name, poles, rate, delay):
             bound=bound,
             radius=radius,
         )
-
-
-def sampled_radius(poles, rate, delay=0):
-    """Spectral radius of ρ integrators under feedback that is held and delayed, with poles (ρ,) [1/s]."""
-    n = len(poles)
-    A, B, K = np.eye(n, k=1)[None], np.eye(n)[None, :, -1:], np.poly(poles).real[None, None, :0:-1]
-    return float(sampled_radii(A, B, K, 1.0 / rate, np.array([delay / rate]))[0])

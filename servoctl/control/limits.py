@@ -17,7 +17,7 @@ from servoctl.control.close import require_names
 from servoctl.control.law import Law
 from servoctl.control.lqr import Q_POSITION, R_INPUT, steady, tangents
 from servoctl.control.reference import Reference, of_plan, require_plant
-from servoctl.control.residuals import Residuals, in_symbols_of, paths_along, program_residuals
+from servoctl.control.residuals import Residuals, as_read, in_symbols_of, paths_along, program_residuals
 from servoctl.control.result import Closed
 from servoctl.control.sampling import discretised
 from servoctl.control.time_law import fastest_along
@@ -92,8 +92,9 @@ def limited(
     For residuals of order 2, w_i times the square of their immediate change is added. With a priority the weights fall
     by 1e-4 from one residual to the next; the choice is made sample by sample, and a residual of high priority is not
     always smaller over a whole motion. The slack of a residual is its deviation after the horizon if the difference is
-    held (for residuals of order 2, its immediate deviation). While there is slack, integrals of residuals in the
-    controller state are held (anti-windup). An estimator predicts with the inputs that act.
+    held (for residuals of order 2, its immediate deviation); of a residual of order 3 or more it is that of F. While
+    there is slack, integrals of residuals in the controller state are held (anti-windup). An estimator predicts with
+    the inputs that act.
 
     Parameters
     ----------
@@ -251,13 +252,13 @@ def _predicted(reference, horizon, weights):
 def _at_once(reference, others):
     """Immediate effects of the inputs on residuals of order 2 along the plan, (N, m) by name; not of `others`."""
     plan, plant = reference.plan, reference.plant
-    program, q = program_residuals(plan.model), plan.model.reduction.mechanism.q
-    second = {name: e for name, e in in_symbols_of(plant, plan.model).items() if name not in others}
+    read, q = as_read(plan.model)[0], plan.model.reduction.mechanism.q
+    second = {name: e for name, e in in_symbols_of(plant, plan.model, read).items() if name not in others}
     for name in second:
-        if (order := q.order(program[name])) > 2:
+        if (order := q.order(read[name])) > 2:
             raise SpecificationError(
                 f"The residual {name!r} has order {order}.",
-                "Slack is given to residuals of order 2 at most, which the state and the inputs determine.",
+                "Slack is given to residuals, or F of which they are derivatives, that state and inputs determine.",
                 do="Leave out sv.limited; the plant limits the commands.",
                 name=name,
                 order=order,

@@ -65,8 +65,9 @@ def lqr(
     integral : bool, float, dict of str to float, or (k,) array, optional
         Weights of the integrals of the program's residuals, by residual; they remove the error that a constant mismatch
         or disturbance leaves. True: 1e4 each, so that an error of 3 mm that lasts for 1 s costs as much as 1 cm of
-        error. Of an output of the mechanism, or a state, the deviation from its value along the plan is integrated; a
-        residual with the name of one is NAME_residual. Default: none.
+        error. Of an output of the mechanism, a state, or F of a residual of order 3 or more that is a derivative of F,
+        the deviation from its value along the plan is integrated; a residual with the name of one is NAME_residual.
+        Default: none.
     varying : bool
         False: frozen-time gains.
 

@@ -141,9 +141,10 @@ def require_plan(plan, plant):
         )
     if model.reduction.ideal:
         raise NotRealisable(
-            "The plan is realised by an ideal reaction.",
+            f"The plan of {', '.join(map(repr, model.reduction.program.names))} is realised by an ideal reaction.",
             "A law commands actuators.",
-            do='Derive the program with by="actuators", and simulate that plan.',
+            do='Derive the program with by="actuators", and follow that plan, whatever its order by sv.lqr.',
+            names=model.reduction.program.names,
         )
     state_names = plan.jet_names[: model.nq + model.n]
     for names, valid, what in (

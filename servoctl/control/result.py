@@ -11,6 +11,7 @@ from servoctl.checks import ON_SAMPLE
 from servoctl.control.conditions import Conditions
 from servoctl.control.law import Law, UserStep, sample_at
 from servoctl.control.loop import Loop, samples_ago
+from servoctl.control.mid_samples import program_rows
 from servoctl.control.residuals import known_residuals
 from servoctl.errors import SpecificationError
 from servoctl.markup import fitted, listed
@@ -120,24 +121,29 @@ class Closed(Sampled, Value):
     @cached_property
     def p(self):
         """The plant's parameters, inputs after the transport delay, and disturbances at each sample, (n_p, N)."""
+        return self.p_within(0)
+
+    def p_within(self, half):
+        """Those of `p` at the start of each sample, in its middle, or at its end: `half` is 0, 1 or 2."""
         loop, inputs = self.loop, self.inputs
+        step, stage = divmod(half * loop.substeps, 2) if half < 2 else (loop.substeps - 1, 2)
         if loop.transport is not None:
-            sent = np.arange(len(self.t)) - samples_ago(0, loop.transport[:, None], loop.substeps)
+            sent = np.arange(len(self.t)) - samples_ago(step, loop.transport[:, None], loop.substeps)
             inputs = np.take_along_axis(inputs, np.maximum(sent, 0), axis=1)
             inputs = np.where(sent < 0, loop.initial_input[:, None], inputs)
         p = self.plant.p(inputs)
-        p[loop.disturbed] = self._disturbances
+        p[loop.disturbed] = self._disturbances(step, stage)
         return p
 
-    @cached_property
-    def _disturbances(self):
-        """Disturbances right after each sample, (n_d, N)."""
+    def _disturbances(self, step, stage):
+        """Disturbances (n_d, N) at the start, in the middle or at the end (stage 0, 1, 2) of a step of each sample."""
         loop = self.loop
         if loop.disturbance is None:
             return np.zeros((0, len(self.t)))
-        steps = np.arange(len(self.t)) * loop.substeps
-        parts = np.minimum(steps if loop.parts is None else loop.parts[steps], len(loop.disturbance) - 1)
-        ends = np.where(np.arange(len(self.t)) < loop.samples, 0, 2)
+        steps = np.minimum(np.arange(len(self.t)) * loop.substeps + step, loop.samples * loop.substeps)
+        parts = steps if loop.parts is None else loop.parts[np.minimum(steps + (stage == 2), steps[-1])] - (stage == 2)
+        parts = np.minimum(parts, len(loop.disturbance) - 1)
+        ends = np.where(np.arange(len(self.t)) < loop.samples, stage, 2)
         return loop.disturbance[parts, ends].T
 
     @property
@@ -159,7 +165,7 @@ class Closed(Sampled, Value):
     def disturbance(self) -> dict[str, np.ndarray]:
         """Disturbances right after each sample, (N,) by generalised force, and by parameter where that is disturbed."""
         calm = {name: np.zeros(len(self.t)) for name in self.plant.disturbable}
-        return calm | dict(zip(self.conditions.disturbance, self._disturbances, strict=True))
+        return calm | dict(zip(self.conditions.disturbance, self._disturbances(0, 0), strict=True))
 
     @property
     def signal(self) -> dict[str, np.ndarray]:
@@ -183,12 +189,12 @@ class Closed(Sampled, Value):
         """Residuals of the plan's program and of material constraints, (levels, N) by name.
 
         Levels are the residual and its derivatives up to the velocities, at the plant's states and parameters. A
-        residual of order 2 is evaluated with the accelerations right after each sample; higher orders are left out.
+        residual of order 2 is evaluated in the middle of each sample; so is F of a residual of order 3 or more that is
+        its k-th derivative: its levels are F minus F along the plan, and the k-th difference quotient of that, which is
+        the residual, over windows of 0.1 s. One without F is evaluated with central differences of the velocities. The
+        last sample, which has no middle, has the values of the one before.
         """
-        residuals = {}
-        if self.plan is not None:
-            jets = np.vstack([self.states, self._evaluated("accelerations")])
-            residuals |= known_residuals(self.plan.model, self.plant).levels(self.t, jets)
+        residuals = program_rows(self) if self.plan is not None else {}
         if self.plant.constrained:
             values = self.plant.function("constraints").grid(self.t, self.states, self.plant.p())
             residuals |= {name: value[None] for name, value in zip(self.plant.constraint_names(), values, strict=True)}
@@ -329,9 +335,12 @@ class Closed(Sampled, Value):
             ends = [f"{name} {sizes[name].max():.3g} / {sizes[name][-1]:.3g}" for name in order]
             lines.append("max / final residual: " * bool(ends) + "; ".join(ends if full else ends[:3]))
             program = self.plan.model.reduction.program.names if self.plan is not None and self.plan.model else ()
-            left_out = [name for name in program if name not in sizes]
-            told = fitted(lambda room: f"not evaluated, as of order 3 or more: {listed(left_out, room)}", full)
-            lines.append(told * bool(left_out))
+            read = known_residuals(self.plan.model, self.plant).integrated if program else {}
+            for what, names in (
+                ("read by what they are derivatives of, minus that along the plan:", [n for n in sizes if n in read]),
+                ("not evaluated, as the loop has too few samples:", [n for n in program if n not in sizes]),
+            ):
+                lines.append(fitted(lambda room: f"{what} {listed(names, room)}", full) * bool(names))  # noqa: B023
             if self.plan is not None and self.t[-1] > self.plan.t[-1] + ON_SAMPLE * loop.period:
                 lines.append(f"the plan ends at t = {self.plan.t[-1]:g} s; its last sample is held")
         return "\n  ".join(filter(None, lines)).splitlines()

@@ -269,9 +269,13 @@ def _law(law, name, quantum=None):
     def answer(t, z, y):
         return law.answer(t, np.append(quantised(y, quantum), z), law.schedule_at(t))
 
+    def output(t, z, y, _):
+        u = answer(t, z, y)[:m]
+        return u if np.any(y) else np.nan_to_num(u)  # python-control asks for it at y = 0 first
+
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,
-        lambda t, z, y, _: answer(t, z, y)[:m],
+        output,
         name=name,
         inputs=signal_names(law.measures, law.inputs),
         outputs=law.inputs,

@@ -412,6 +412,11 @@ class Equations(Invariants):
         expressions = [*map(self._without_higher, expressions), *invariants.values()]
         return [*names, *((name, 0) for name in invariants)], expressions
 
+    def of_state(self, expression):
+        """An expression of any jets as one of the state."""
+        highest = self.saddle[0] if self.sparse else self.dense()
+        return ca.substitute(self._without_higher(expression), self.q.jet(self.top), highest)
+
     def _without_higher(self, expression):
         """An expression with the jets above s̄, which the rows determine, replaced by their values.
 

@@ -128,6 +128,7 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
             program.by,
             program.metric,
             program.jumps,
+            [list(program.integrals), program.stated],
             *(
                 [(name, None if isinstance(e, ca.SX) else float(e)) for name, e in chosen.items()]
                 for chosen in (program.weights, program.toward)
@@ -140,7 +141,7 @@ def fingerprint(mechanism, program, guess=None, near=None, values=None):
         ]
         chosen = (*program.weights.values(), *program.toward.values())
         residuals = [*program.residuals.values(), *program.with_turns.values()]
-        expressions = [*residuals, *(e for e in chosen if isinstance(e, ca.SX))]
+        expressions = [*residuals, *program.integrals.values(), *(e for e in chosen if isinstance(e, ca.SX))]
         function = mechanism.q.as_function(expressions, mechanism.parameters.symbols)
         text = "\n".join([json.dumps(facts, allow_nan=False), mechanism.as_text(), function.serialize()])
     except Exception:  # CasADi raises bare ones; the derivation says what is wrong

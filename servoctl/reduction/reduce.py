@@ -286,7 +286,7 @@ def require_parts(mechanism, program, guess):
     for name, expression in program.residuals.items():
         require_known(expression, mechanism, f"the residual {name!r}")
     chosen = {"weight": program.weights, "wish": program.toward}
-    for what, values in chosen.items():
+    for what, values in (chosen | {"integral": program.integrals}).items():
         for name, expression in values.items():
             require_known(ca.SX(expression), mechanism, f"the {what} of {name!r}")
     twice = [name for name in program.residuals if name in mechanism.constraints]
@@ -309,6 +309,10 @@ def require_parts(mechanism, program, guess):
         named(name, known, "coordinate or derivative")
         finite(name, value)
     distinct("residual", (*program.residuals, *mechanism.constraints), mechanism.signals)  # refuses ambiguous names
+    if program.stated:
+        from servoctl.spec.integrals import require_integrals
+
+        require_integrals(q, program)
     full = [by_name(values, mechanism.actuators, "actuator", f"The {what}s") for what, values in chosen.items()]
     return program.again(program.with_turns, *full) if full != [*chosen.values()] else program
 

@@ -45,6 +45,31 @@ class Column(ca.SX):
             return super().__array_function__(func, (ca.SX,), args, kwargs)
 
 
+def _linear(name):
+    """A linear operation of SX that finds the antiderivative, too; what has none counts as a function of time."""
+
+    def applied(self, *others):
+        operation = getattr(ca.SX, name)
+        value, of = operation(self, *others), operation(self.of, *(getattr(one, "of", 0) for one in others))
+        same = value.shape == self.shape and all(getattr(one, "k", self.k) == self.k for one in others)
+        return Rate(value, of, self.k) if same else value
+
+    return applied
+
+
+class Rate(ca.SX):
+    """A k-th total derivative that knows its antiderivative `of`, which sums keep."""
+
+    __add__, __radd__, __sub__, __rsub__, __neg__ = map(_linear, "__add__ __radd__ __sub__ __rsub__ __neg__".split())
+
+    def __init__(self, value, of, k):
+        super().__init__(value)
+        self.of, self.k = of, k
+
+    def __getitem__(self, place):
+        return Rate(super().__getitem__(place), self.of[place], self.k)
+
+
 class Coordinates:
     """Generalised coordinates q, quasi-velocities w with q' = V w + h (3.1), and jets of any order.
 
@@ -293,10 +318,14 @@ class Coordinates:
         Returns
         -------
         SX of the same shape
+            A residual that is the sum of it and functions of time has the expression as its integral.
         """
         items = column(expression, "the expression")
         result = ca.vertcat(*self.derivatives(items, _order(k))[k])
-        return ca.reshape(result, *expression.shape) if isinstance(expression, ca.SX) else result
+        shape = expression.shape if isinstance(expression, ca.SX) else result.shape
+        of, below = (expression.of, expression.k) if isinstance(expression, Rate) else (ca.vertcat(*items), 0)
+        result, of = ca.reshape(result, *shape), ca.reshape(of, *shape)
+        return Rate(result, of, k + below) if k else result
 
     def where(self, symbol):
         """What a symbol is: ("t", 0, 0), ("q", 0, i), ("w", k, i) for γ_i^(k), ("r", k, i) for r_i^(k), or None."""

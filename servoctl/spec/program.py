@@ -3,11 +3,11 @@
 import casadi as ca
 import numpy as np
 
-from servoctl.checks import column, finite, mapping, named, positive, require_kind, within, without_effect
+from servoctl.checks import by_name, column, finite, mapping, named, positive, require_kind, within, without_effect
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import without_turns
 from servoctl.jets.overflow import settled
-from servoctl.spec.coordinates import Coordinates
+from servoctl.spec.coordinates import Coordinates, Rate
 from servoctl.spec.packing import Packed
 from servoctl.spec.references import orders_in
 
@@ -36,6 +36,10 @@ class Program(Packed):
 
     jumps : bool, optional
         Whether forces may jump at breaks of the paths of references. By default a path of too low a class is refused.
+    integrals : dict of str to SX scalar, optional
+        F by residual, of order at most 2, where the residual is the k-th time derivative of F, up to a function of
+        time: what a loop reads, and feeds back, of residuals of order 3 and more. Known without it where a residual is
+        written as `q.dt(F, k) - ...`.
 
     Attributes
     ----------
@@ -52,7 +56,7 @@ class Program(Packed):
         If `by` is another word.
     """
 
-    def __init__(self, residuals, by="actuators", weights=None, toward=None, jumps=False):
+    def __init__(self, residuals, by="actuators", weights=None, toward=None, jumps=False, integrals=None):
         if not isinstance(residuals, dict) or not residuals:
             raise SpecificationError(
                 f"The program's residuals are {residuals!r}.",
@@ -71,6 +75,10 @@ class Program(Packed):
         weights = None if self.metric == "inertia" else weights
         self.weights = {name: _weight(name, value) for name, value in mapping(weights, "The weights").items()}
         self.toward = {name: _wish(name, value) for name, value in mapping(toward, "The wishes").items()}
+        found = {name: value.of for name, value in residuals.items() if isinstance(value, Rate)}
+        given = by_name(mapping(integrals, "The integrals"), self.residuals, "residual", "The integrals")
+        given = {name: column(value, f"The integral of {name!r}", 1)[0] for name, value in given.items()}
+        self.integrals, self.stated = found | given, tuple(given)
 
     def __eq__(self, other):
         """Whether names, choices and expressions in symbols of the same names are the same."""
@@ -83,7 +91,7 @@ class Program(Packed):
 
     def _facts(self):
         """Names, choices, symbols' names and expressions as text."""
-        parts = (self.with_turns, self.weights, self.toward)
+        parts = (self.with_turns, self.weights, self.toward, self.integrals)
         expressions = [ca.SX(value) for part in parts for value in part.values()]
         symbols = ca.symvar(ca.vertcat(*expressions))
         text = ca.Function("program", symbols, expressions).serialize()
@@ -172,18 +180,23 @@ class Program(Packed):
             )
         symbols, values = [q.t], [instant + (q.t - instant) / sigma]
         weights = {name: ca.SX(value) for name, value in self.weights.items()}
-        for k in range(1, max(map(q.order, (*self.with_turns.values(), *weights.values()))) + 1):
+        parts = (self.with_turns, weights, self.integrals)
+        every = [value for part in parts for value in part.values()]
+        for k in range(1, max(map(q.order, every)) + 1):
             symbols += q.gamma(k)
             values += [sigma**k * s for s in q.gamma(k)]
-        for symbol in ca.symvar(ca.vertcat(*self.with_turns.values(), *weights.values())):
+        for symbol in ca.symvar(ca.vertcat(*every)):
             place = q.where(symbol)
             if place and place[0] == "r" and place[1]:
                 symbols, values = [*symbols, symbol], [*values, sigma ** place[1] * symbol]
-        slower = iter(ca.substitute([*self.with_turns.values(), *weights.values()], symbols, values))
-        residuals = {name: next(slower) for name in self.residuals}
-        weights = {name: next(slower) for name in weights}
+        slower = iter(ca.substitute(every, symbols, values))
+        residuals, weights, integrals = ({name: next(slower) for name in part} for part in parts)
         toward = {name: ca.substitute(ca.SX(wish), q.t, values[0]) for name, wish in self.toward.items()}
-        return self.again(residuals, weights, toward)
+        program = self.again(residuals, weights, toward)
+        program.integrals = {
+            name: sigma ** (q.order(residuals[name]) - q.order(F)) * F for name, F in integrals.items()
+        }
+        return program
 
     def again(self, residuals, weights, toward):
         """A program with other expressions, realised alike.
@@ -194,7 +207,9 @@ class Program(Packed):
         weights, toward : dict of str to float or SX
         """
         weights = "inertia" if self.metric == "inertia" else weights or None
-        return Program(residuals, self.by, weights, toward or None, self.jumps)
+        program = Program(residuals, self.by, weights, toward or None, self.jumps)
+        program.integrals, program.stated = self.integrals, self.stated
+        return program
 
     def __repr__(self):
         return f"Program({', '.join(self.residuals)}; by {self.by})"
@@ -204,7 +219,7 @@ def no_program(jumps=False):
     """The program without residuals: forces alone determine the motion, and may jump if so."""
     program = object.__new__(Program)
     program.by, program.residuals, program.with_turns, program.weights, program.toward = "actuators", {}, {}, {}, {}
-    program.metric, program.jumps = "actuators", jumps
+    program.metric, program.jumps, program.integrals, program.stated = "actuators", jumps, {}, ()
     return program
 
 

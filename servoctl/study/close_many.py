@@ -14,7 +14,7 @@ from servoctl.control.batch import Gathered, run_batch, unit
 from servoctl.control.close import close, require_consistent
 from servoctl.control.conditions import Timing, index, steps
 from servoctl.control.noise import first_words
-from servoctl.control.residuals import Residuals
+from servoctl.control.residuals import Residuals, program_residuals
 from servoctl.control.result import Closed
 from servoctl.errors import IntegrationStopped, ServoError, SpecificationError, unknown
 from servoctl.plants.equations import equations_at
@@ -156,7 +156,8 @@ def _unit(run):
 @lru_cache(32)
 def _residuals_of_state(model, plant):
     """The residuals of a program that are functions of the state; None if there are none."""
-    residuals = Residuals(model, plant)
+    order, rows = model.reduction.mechanism.q.order, program_residuals(model)
+    residuals = Residuals(model, plant, rows={name: e for name, e in rows.items() if order(e) <= 1})
     return residuals if residuals.names else None
 
 
