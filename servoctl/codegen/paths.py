@@ -74,11 +74,11 @@ class Followed:
 
     @cached_property
     def _library(self):
-        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _library(compiler.compiler())
+        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _of_paths(compiler.compiler())
 
 
 @cache
-def _library(command):
+def _of_paths(command):
     """The library of paths.c by the compiler that a command calls; None without one."""
     return compiler.library(IN_C, "-O2", exact=True, calls=0) if command else None
 

@@ -15,10 +15,10 @@ from servoctl.model.equations import invariant_names
 from servoctl.values import frozen
 
 PARTS = 4  # of a step, at least, at whose ends arguments are evaluated
-NEAR = 0.05  # of its largest distance from an edge so far: an argument that turns within it may have met the edge
+TURNS_WITHIN = 0.05  # of its largest distance from an edge so far: an argument that turns within it may have met the edge
 OF_TERMS = 1e-3  # of the terms of a residual: one that changes by more at an edge jumps
-BESIDE = 0.5 ** np.arange(20, 1, -1)  # of the span: distances from an edge at which residuals are compared
-AT_ONCE = 1e-6  # of the span: a motion that stops so near an edge stops because of it
+DISTANCES = 0.5 ** np.arange(20, 1, -1)  # of the span: distances from an edge at which residuals are compared
+BECAUSE_OF = 1e-6  # of the span: a motion that stops so near an edge stops because of it
 EXPLAINS = 1e-3  # distance of an argument from its edge that explains why a motion cannot go on
 
 
@@ -90,7 +90,7 @@ class Edges:
                 known = max(forward * at, forward * t[0]) * forward
                 error = _jump(model, at, arguments.words[i], change)
                 return End(int(steps_of(t, known)), known, state(np.array([known]))[:, 0], error=error)
-            if abs(t[-1] - at) < BESIDE[-1] * self.span:
+            if abs(t[-1] - at) < DISTANCES[-1] * self.span:
                 before[0, after[2] == 1] = np.nan
                 self.met.append((at, i, before))
         return None
@@ -99,7 +99,7 @@ class Edges:
         """The error of a motion that cannot go on at t, right beyond an edge; None elsewhere."""
         arguments = arguments_of(model)
         for at, i, _ in self.met:
-            if abs(t - at) < AT_ONCE * self.span:
+            if abs(t - at) < BECAUSE_OF * self.span:
                 row = arguments.rows[i]
                 return _stop(f"The program of {row!r} ends", at, arguments.words[i], row, level=row)
         return None
@@ -116,7 +116,7 @@ class Edges:
         largest = np.fmax(largest, np.nanmax(size, axis=1, initial=0.0))
         self.seen, result = (at[-2:-1], z[:, -2:-1], largest, last), []
         crossed = z[:, :-1] * z[:, 1:] < 0
-        turned = (size[:, 1:-1] <= np.fmin(size[:, :-2], size[:, 2:])) & (size[:, 1:-1] < NEAR * largest[:, None])
+        turned = (size[:, 1:-1] <= np.fmin(size[:, :-2], size[:, 2:])) & (size[:, 1:-1] < TURNS_WITHIN * largest[:, None])
         for wide, places in ((1, crossed), (2, turned)):
             for i, k in np.argwhere(places):
                 a, b = max(forward * at[k], forward * t[0]) * forward, at[k + wide]
@@ -131,7 +131,7 @@ class Edges:
         They are those of the nearest instant at which tolerances resolve them, or of one farther than a thousandth of
         the span: infinite where they have no value, and NaN where no instant is so far.
         """
-        times = at + side * self.span * BESIDE
+        times = at + side * self.span * DISTANCES
         times, m = times[(times - t[0]) * (times - t[-1]) <= 0], len(invariant_names(model))
         result = np.full((3, m), np.nan)
         if not len(times):
