@@ -15,7 +15,7 @@ from servoctl.model.equations import invariant_names
 from servoctl.values import frozen
 
 PARTS = 4  # of a step, at least, at whose ends arguments are evaluated
-TURNS_WITHIN = 0.05  # of its largest distance from an edge so far: an argument that turns within it may have met the edge
+CLOSE = 0.05  # of its largest distance from an edge so far: an argument that turns within it may have met the edge
 OF_TERMS = 1e-3  # of the terms of a residual: one that changes by more at an edge jumps
 DISTANCES = 0.5 ** np.arange(20, 1, -1)  # of the span: distances from an edge at which residuals are compared
 BECAUSE_OF = 1e-6  # of the span: a motion that stops so near an edge stops because of it
@@ -116,7 +116,7 @@ class Edges:
         largest = np.fmax(largest, np.nanmax(size, axis=1, initial=0.0))
         self.seen, result = (at[-2:-1], z[:, -2:-1], largest, last), []
         crossed = z[:, :-1] * z[:, 1:] < 0
-        turned = (size[:, 1:-1] <= np.fmin(size[:, :-2], size[:, 2:])) & (size[:, 1:-1] < TURNS_WITHIN * largest[:, None])
+        turned = (size[:, 1:-1] <= np.fmin(size[:, :-2], size[:, 2:])) & (size[:, 1:-1] < CLOSE * largest[:, None])
         for wide, places in ((1, crossed), (2, turned)):
             for i, k in np.argwhere(places):
                 a, b = max(forward * at[k], forward * t[0]) * forward, at[k + wide]

@@ -213,16 +213,7 @@ class RadauSteps(BulkSteps):
         super().__init__(model, "RadauIIA", drift, progress)
 
     def _function(self, model, poles):
-        f = radau_loop(model, poles)
-        if f.native("radau") is None:
-            raise SpecificationError(
-                "method='RadauIIA' was given, and there is no C compiler.",
-                "The loop over its steps is C code.",
-                nearest="method='Radau', scipy's of order 5.",
-                do="Use it, or install a C compiler (gcc or clang).",
-                method="RadauIIA",
-            )
-        return f
+        return radau_loop(model, poles)
 
     def halved(self, model, t, x, h):
         """States (n_x, 3) at t, t + h and t + 2 h by two steps; fewer if one fails."""
@@ -238,6 +229,14 @@ class RadauSteps(BulkSteps):
             self.taken.append((self.model, steps.t[first : last + 1], steps.x[:, first : last + 1]))
 
     def _begin(self, a, x, b):
+        if self.f.native("radau") is None:  # compiled here, as the start may choose other pivots
+            raise SpecificationError(
+                "method='RadauIIA' was given, and there is no C compiler.",
+                "The loop over its steps is C code.",
+                nearest="method='Radau', scipy's of order 5.",
+                do="Use it, or install a C compiler (gcc or clang).",
+                method="RadauIIA",
+            )
         if self.step is None:
             self.h = first_step(self.f, a, x, self.p, b - a, self.settings)
             self.motion.count(nfev=2)
