@@ -85,7 +85,7 @@ def test_what_is_small_flat_or_without_a_value_at_most_points_does_not_vanish(ex
 # The beam's two ropes, its level and its hidden balance cancel by numbers: with others the orders are decided again.
 @pytest.mark.parametrize("name", [name for name in gallery if name != "beam-crane"])
 def test_the_orders_of_the_gallery_rest_on_identities_alone(name, gallery_model):
-    assert not gallery_model(name).reduction.orders
+    assert not gallery_model(name).reduction.rests
 
 
 # other numbers --------------------------------------------------------------------------------------------------------
@@ -235,7 +235,7 @@ def test_a_memoised_derivation_keeps_what_its_orders_rest_on(monkeypatch, tmp_pa
     monkeypatch.setattr(models, "reduce", lambda *given: derived.append(given) or reduce(*given))
     for count in (2, 2):  # as it is, and with the other order; then both are read
         model = sv.derive(*by_parameter(0.0, "order"))
-        assert model.reduction.orders and model.free == 2
+        assert model.reduction.rests and model.free == 2
         assert model.with_parameters(e=0.3).free == 3
         assert len(derived) == count
 
@@ -478,7 +478,7 @@ def test_many_loops_whose_constraint_could_change_its_order_are_judged_one_by_on
     model = sv.derive(mechanism, sv.Program({"X": x - 0.1 * ca.sin(mechanism.q.t)}, by="actuators"))
     plan = sv.simulate(model, model.start(), (0.0, 0.5))
     run = sv.close(sv.plant(mechanism), sv.lqr(plan, sv.plant(mechanism), rate=50.0), plan.state(0.0), (0.0, 0.5))
-    assert run.plant.equations.orders
+    assert run.plant.equations.rests
     many = sv.close_many(run, {"a": [1.0, 1.0]}, record=["x"])
     assert many.trace["x"][:, 0] == pytest.approx(run["x"], abs=1e-12)
     with refused(SpecificationError):

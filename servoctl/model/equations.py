@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.checks import distinct
 from servoctl.codegen.paths import combined
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import size_of_terms
+from servoctl.jets.branches import size_of_terms, sizes_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate
@@ -314,6 +314,17 @@ class Equations(Invariants):
         largest = reduce(ca.fmax, map(ca.fabs, terms))
         return self.function("balanced", ca.vertcat(self.jets, inputs, wanted, reactions), [left, largest, sums])
 
+    @cached_property
+    def written(self):
+        """The full equations as they are written, (SX, ...), with jets up to s̄."""
+        return [self._without_higher(e) for e in self.r.full.values()]
+
+    def full(self):
+        """The full equations as they are written, by `sized`, of (t, Z, p)."""
+        first = self.q.nq
+        usual = (self.points.sizes(self.top) * self.points.factorials(self.top))[first:]
+        return self.function("full", self.jets, sized(self.written, self.jets[first:], usual))
+
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
 
@@ -442,6 +453,7 @@ EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "invariants": lambda e: (e.invariants(),),
     "matrices": lambda e: (e.matrices(),),
     "balanced": lambda e: (e.balanced(),),
+    "full": lambda e: (e.full(),),
     "accelerations": lambda e: (saddle.accelerations(e),),
 }
 
@@ -462,6 +474,12 @@ SIGNALS = {  # names and expressions of each group
     "power": Equations._power,
     "reach": Equations._reach,
 }
+
+
+def sized(values, rates, usual):
+    """Expressions, the sizes of their terms, and these sizes where `rates` have at least their usual sizes."""
+    sizes = ca.vertcat(ca.SX(0, 1), *sizes_of_terms(values))
+    return [*values, sizes, ca.substitute(sizes, rates, ca.if_else(ca.fabs(rates) < usual, usual, rates))]
 
 
 def _level_name(name, j):

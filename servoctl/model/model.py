@@ -308,7 +308,7 @@ class Model(Detailed):
         ----------
         name : str
             "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants",
-            "matrices", "balanced", or "accelerations".
+            "matrices", "balanced", "full", or "accelerations".
 
         Returns
         -------

@@ -17,7 +17,7 @@ from servoctl.model.points import place_of, through, with_place
 from servoctl.reduction.appell import NEGATIVE
 from servoctl.reduction.manifold import ON_MANIFOLD, at_nominal_size, gradient_scales, least_steps
 from servoctl.reduction.ranks import clean
-from servoctl.reduction.reduce import HELD, WEAKER, strong
+from servoctl.reduction.reduce import WEAKER, strong
 from servoctl.tolerances import ENTRY, TINY
 from servoctl.values import frozen
 
@@ -29,17 +29,16 @@ MOVES = 8  # Newton steps of a point to the manifold of other parameters
 class Quantities:
     """What decides whether a derivation is valid, as a function of (t, Z, p).
 
-    The groups are "slopes" that vanish with their "jets" and "terms", "pivots", "conditions", which vanish, and the
-    inertia matrix, "mass", which has no sizes.
+    The groups are "pivots", the full equations, "conditions", and the inertia matrix, "mass", which has no sizes.
     """
 
-    function: object  # values and sizes of the terms of all groups; None if these contain jets above s̄
+    function: object  # values and sizes of the terms of all groups; None where points have no paths of their own
     counts: dict  # scalars in each group, by name
     pivots: np.ndarray  # (n_pivots,), least sizes at the points where they were chosen
 
     def at(self, t, jets, values, place=()):
         """Values and sizes (2, n, N) of each group, by name; the parameters (n_p,) or (n_p, N)."""
-        result = _evaluated(self.function, t, jets, values, place)
+        result = _evaluated(self.function, t, jets, with_place(place, values))
         result = result.reshape(2, -1, len(t))
         return dict(zip(self.counts, np.split(result, np.cumsum([*self.counts.values()])[:-1], axis=1), strict=True))
 
@@ -49,9 +48,6 @@ def quantities(equations):
     r, groups = equations.r, _groups(equations)
     scalars = [ca.SX(e) for group in groups.values() for e in group]
     counts = {name: len(group) for name, group in groups.items()}
-    places = filter(None, map(r.mechanism.q.where, ca.symvar(ca.vertcat(*scalars))))
-    if any(level > r.top for of, level, _ in places if of == "w"):
-        return Quantities(None, counts, np.zeros(0))
     sized = len(scalars) - counts["mass"]
     sizes = [*sizes_of_terms(scalars[:sized]), ca.SX(counts["mass"], 1)]
     f = compiled(equations.function("quantities", equations.jets, [*scalars, *sizes]), "quantities")
@@ -66,13 +62,9 @@ def quantities(equations):
 
 def _groups(equations):
     r = equations.r
-    slopes, jets, terms = r.orders.vanishing
     return {
-        "slopes": slopes,
-        "jets": jets,
-        "terms": terms,
         "pivots": [pivot for _, pivot in equations.all_pivots],
-        "conditions": r.conditions,
+        "conditions": equations.written,
         "mass": ca.densify(r.mechanism.mass).nonzeros(),
     }
 
@@ -145,13 +137,13 @@ def _plainly_valid(model, x, values):
     moving = bool(set(varied) & set(_of_invariants(model)))
     varied = None if moving else varied
     criterion = model.once(f"criterion {varied}", lambda: _criterion(model, varied))
-    if criterion is None:
-        return result
     for first in range(0, len(result), TOGETHER):
         part = values[:, first : first + TOGETHER]
         count = part.shape[1]
-        at = np.repeat(t, count), np.repeat(x, count, axis=1), np.tile(part, len(t))
-        met = _evaluated(criterion, *(_on_manifold(model, *at) if moving else at), _place(model))
+        times, states = np.repeat(t, count), np.repeat(x, count, axis=1)
+        p = with_place(_place(model), np.tile(part, len(t)))
+        states = on_manifold(model, times, states, p) if moving else states
+        met = _evaluated(criterion, times, states, p)
         result[first : first + count] = (met > 0).reshape(len(t), count).all(axis=0)
     return result
 
@@ -159,8 +151,7 @@ def _plainly_valid(model, x, values):
 def _criterion(model, varied):
     """A function of (t, X, p), positive where a derivation is valid, each bound being met at each point by itself.
 
-    It has only what depends on the varied parameters, or all where points move with them (None). There is no function
-    if slopes of rows depend on them: these are judged at all points together.
+    It has only what depends on the varied parameters, or all where points move with them (None).
     """
     known, equations = model.once("quantities", lambda: quantities(model.equations)), model.equations
     t, x, p, n, n_x = equations.q.t, equations.state, equations.parameters, model.n, len(model.state_names)
@@ -171,10 +162,8 @@ def _criterion(model, varied):
     some = {i % value.numel() for i, depends in enumerate(depend) if depends}
     starts = np.cumsum([0, *known.counts.values()]).tolist()
     groups = {name: range(*ends) for name, *ends in zip(known.counts, starts[:-1], starts[1:], strict=True)}
-    if some & {*groups["slopes"], *groups["jets"], *groups["terms"]}:
-        return None
     met = [ca.SX(1)]
-    met += [ca.fabs(value[i]) <= HELD * ca.fmax(size[i], TINY) for i in some & {*groups["conditions"]}]
+    met += [ca.fabs(value[i]) <= ENTRY * ca.fmax(size[i], TINY) for i in some & {*groups["conditions"]}]
     for i, least in zip(groups["pivots"], (WEAKER * known.pivots).tolist(), strict=True):
         met += [ca.fabs(value[i]) >= least, ca.fabs(value[i]) > ENTRY * size[i]] if i in some else []
     if some & {*groups["mass"]}:
@@ -185,8 +174,8 @@ def _criterion(model, varied):
     return compiled(equations.function("criterion", x, [reduce(ca.logic_and, met)]), "criterion")
 
 
-def _on_manifold(model, t, x, p):
-    """Points (t, x, p) moved to the manifolds of the parameters, as far as Newton's method of full ranks does so."""
+def on_manifold(model, t, x, p):
+    """States x (n_x, N) moved to the constraint manifolds of p, as far as Newton's method of full ranks does so."""
 
     def step():
         at = model.equations.q.t, model.equations.state, model.equations.parameters
@@ -194,11 +183,11 @@ def _on_manifold(model, t, x, p):
 
     f = model.once("to the manifold", step)
     for _ in range(MOVES):
-        *moved, near = _evaluated(f, t, x, p, _place(model))
+        *moved, near = _evaluated(f, t, x, p)
         if (near > 0).all():
             break
         x = np.array(moved)
-    return t, x, p
+    return x
 
 
 def _manifold(model, t, x, p):
@@ -231,18 +220,13 @@ def _valid(model, known, t, z, values):
         return {name: group.reshape(*group.shape[:2], cases, group.shape[2] // cases) for name, group in found.items()}
 
     found = at(z)
-    (slopes, of_slopes), (jets, _), (_, terms) = found["slopes"], found["jets"], found["terms"]
-    jets, terms = (np.max(np.abs(each), axis=2, keepdims=True, initial=0.0) for each in (jets, terms))
-    slopes = np.abs(slopes)
-    dead = (slopes <= ENTRY * of_slopes) | (slopes * np.maximum(jets, 1.0) <= ENTRY * terms)
     left, of_left = found["conditions"]
-    if not (np.abs(left) <= HELD * np.maximum(of_left, TINY)).all():  # a velocity that is kept at zero is rounding
+    if not (np.abs(left) <= ENTRY * np.maximum(of_left, TINY)).all():  # a velocity that is kept at zero is rounding
         sizes = r.points.sizes(r.top) * r.points.factorials(r.top)
         of_left = np.maximum(of_left, at(at_nominal_size(z, sizes, model.nq))["conditions"][1])
     checks = (
-        dead,
         strong(clean(*found["pivots"]), known.pivots[:, None, None]),
-        np.abs(left) <= HELD * np.maximum(of_left, TINY),
+        np.abs(left) <= ENTRY * np.maximum(of_left, TINY),
     )
     positive = _positive(found["mass"][0].reshape(n, n, -1)).reshape(cases, -1).all(axis=1)
     return np.all([check.all(axis=(0, 2)) for check in checks], axis=0) & positive
@@ -274,11 +258,11 @@ def _moved(model, at, values):
     invariants, rates = model.function("invariants"), model.function("ode")
     t = np.tile(points.t.astype(float), cases)
     x = np.tile(at, cases)
-    p, m, place = np.repeat(values, n_points, axis=1), len(invariant_names(model)), _place(model)
+    p, m = with_place(_place(model), np.repeat(values, n_points, axis=1)), len(invariant_names(model))
     left, moved = np.arange(cases), np.zeros(cases, bool)
     for _ in range(MOVES):
         here = (left[:, None] * n_points + np.arange(n_points)).ravel()
-        y = _evaluated(invariants, t[here], x[:, here], p[:, here], place)
+        y = _evaluated(invariants, t[here], x[:, here], p[:, here])
         residual, jacobian = y[:m], y[m:].reshape(n_x, m, len(here)).swapaxes(0, 1)
         finite = np.isfinite(y).all(axis=0)
         near = (np.abs(residual) <= ON_MANIFOLD * gradient_scales(jacobian, x[:, here], sizes)).all(axis=0) & finite
@@ -291,13 +275,12 @@ def _moved(model, at, values):
         x[:, here[on]] += least_steps(jacobian[:, :, on], residual[:, on], sizes).astype(float)
     here = np.flatnonzero(np.repeat(moved, n_points))
     t, x = t[here], x[:, here]
-    highest = _evaluated(rates, t, x, p[:, here], place)[n_x - model.n : n_x]
+    highest = _evaluated(rates, t, x, p[:, here])[n_x - model.n : n_x]
     return np.flatnonzero(moved), t, np.vstack([x, highest])
 
 
-def _evaluated(f, t, x, p, place):
+def _evaluated(f, t, x, p):
     """The outputs (n_y, N) of a Compiled, which few points do not load."""
-    p = with_place(place, p)
     if len(t) > GRID_POINTS:
         return f.grid(t, x, p)
     y = np.empty((f.n_y, len(t)))

@@ -10,16 +10,15 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.codegen.interpreted import Interpreter
 from servoctl.errors import SpecificationError
-from servoctl.model.equations import Invariants
+from servoctl.model.equations import Invariants, sized
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context, follows, sample
-from servoctl.reduction.orders import Orders
 from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, references, strong
 from servoctl.reduction.rows import as_rows
 from servoctl.spec.program import no_program
 from servoctl.spec.references import Jets, called, function_of
-from servoctl.tolerances import TINY
+from servoctl.tolerances import ENTRY, TINY
 from servoctl.values import Identity
 
 LATEST = 32  # plants whose equations stay in memory
@@ -147,26 +146,38 @@ class PlantEquations:
 
         return values
 
+    @property
+    def rests(self):
+        """Whether the order of a material constraint rests on slopes that may be active elsewhere."""
+        return any(row.rests for row in self._material[0])
+
     @cached_property
-    def orders(self):
-        """What the orders of the material constraints rest on."""
-        rows, points = self._material
-        return Orders(tuple(rows), tuple(rows), 2, points)
+    def _written(self):
+        """The material constraints as they are written."""
+        return [self.q.on_spheres(e) for e in self.mechanism.constraints.values()]
+
+    def full(self):
+        """The material constraints as they are written, by `sized`."""
+        values = ca.substitute(self._written, [ca.vertcat(*self.q.gamma(2))], [self.acceleration])
+        usual = self._material[1].sizes(1)[self.q.nq :]
+        return self.function("full", sized(values, self.velocity, usual))
 
     def hold(self, values):
         """Whether orders and pivots may stay as they are with other parameters (n_p,) or (n_p, N)."""
         values = _cases(values)
         if np.array_equal(values, np.broadcast_to(self.values[:, None], values.shape)):
             return True
-        if self.orders and not all(self.orders.hold(self._points(case)) for case in values.T):
+        if self.rests and not all(map(self._still, values.T)):
             return False
         here, usual = (np.abs(self._pivots(v)).min(axis=2, initial=np.inf) for v in (values, self.values[:, None]))
         return bool(strong(here, usual).all())
 
-    def _points(self, values):
-        """Points of the material constraints with other parameters."""
+    def _still(self, values):
+        """Whether the material constraints hold as they are written where their rows do with other parameters."""
         rows, points = self._material
-        return sample(self.q, rows, 2, Context(points.parameters, values, WINDOW, {}), starts=points)
+        points = sample(self.q, rows, 2, Context(points.parameters, values, WINDOW, {}), starts=points)
+        left, sizes = points.evaluate(self._written)
+        return bool(np.all(np.abs(left) <= ENTRY * sizes))
 
     @cached_property
     def _pivots(self):
