@@ -180,11 +180,6 @@ class Equations(Invariants):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
         return [(name, p) for name, p in self.all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
 
-    def constant_pivots(self):
-        """A function of the parameters: the pivots that depend on these alone."""
-        constant = [p for _, p in self.all_pivots if all(self.q.where(s) is None for s in ca.symvar(p))]
-        return ca.Function("constant_pivots", [self.parameters], [ca.vertcat(*constant)])
-
     @property
     def pivot_sizes(self):
         """Largest size of each pivot at the points where the pivots were chosen, (n_g,) array."""
@@ -314,16 +309,11 @@ class Equations(Invariants):
         largest = reduce(ca.fmax, map(ca.fabs, terms))
         return self.function("balanced", ca.vertcat(self.jets, inputs, wanted, reactions), [left, largest, sums])
 
-    @cached_property
-    def written(self):
-        """The full equations as they are written, (SX, ...), with jets up to s̄."""
-        return [self._without_higher(e) for e in self.r.full.values()]
-
     def full(self):
         """The full equations as they are written, by `sized`, of (t, Z, p)."""
-        first = self.q.nq
+        values, first = [self._without_higher(e) for e in self.r.full.values()], self.q.nq
         usual = (self.points.sizes(self.top) * self.points.factorials(self.top))[first:]
-        return self.function("full", self.jets, sized(self.written, self.jets[first:], usual))
+        return self.function("full", self.jets, sized(values, self.jets[first:], usual))
 
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).

@@ -1,17 +1,119 @@
-"""Whether reduced equations satisfy the full ones, as their designer wrote them, along a motion.
+"""Whether reduced equations satisfy the full ones, as these are written: with other numbers, and along a motion.
 
 A slope that vanishes where a row is derived lowers the row's order, and what it is a slope of is left out. If it does
-not vanish identically, that may come alive: a gear that is blended in at 3 s, a coupling beyond x = 2. From there on a
-motion by the reduced equations leaves the full ones.
+not vanish identically, that may come alive: a gear that is blended in at 3 s, a coupling beyond x = 2, a parameter that
+was zero. What the reduced equations give then leaves the full ones.
 """
 
+from functools import reduce
+
+import casadi as ca
 import numpy as np
 
+from servoctl.codegen.function import compiled
 from servoctl.errors import SingularProgram
-from servoctl.model.validity import on_manifold
+from servoctl.jets.branches import sizes_of_terms
+from servoctl.model.equations import invariant_names
+from servoctl.model.points import place_of, with_place
+from servoctl.reduction.appell import NEGATIVE
+from servoctl.reduction.manifold import ON_MANIFOLD
+from servoctl.reduction.reduce import WEAKER
 from servoctl.tolerances import ENTRY
 
+TOGETHER = 1000  # sets of parameters, which bounds the memory
+MOVES = 8  # Newton steps of a point to the manifold of other parameters
 DRIFTED = 1e-6  # of its terms: below this a residual may be due to drift; above, it is judged on the manifold
+
+
+def affirmed(model, values):
+    """For which parameters (n_p, C) a derivation is certainly valid, (C,) array of bool.
+
+    That is so where the points at which ranks were decided, as far as they reach the manifold of these parameters,
+    satisfy the full equations there, with a positive inertia, and pivots are neither rounding nor far weaker.
+    """
+    points, result = model.reduction.points, np.zeros(values.shape[1], bool)
+    place = place_of(model, [_criterion(model), _to_manifold(model)])
+    if place is None or not len(points):
+        return result
+    t, x = points.t.astype(float), np.vstack([points.jet(k) for k in range(model.reduction.top)]).astype(float)
+    x = on_manifold(model, t, x, with_place(place, model.parameters))
+    for first in range(0, len(result), TOGETHER):
+        p = with_place(place, values[:, first : first + TOGETHER])
+        count = p.shape[1]
+        at = np.repeat(t, count), np.repeat(x, count, axis=1), np.tile(p, len(t))
+        near, met = (each.reshape(-1, count) for each in _judged(model, *at))
+        result[first : first + count] = near.any(axis=0) & (met | ~near).all(axis=0)
+    return result
+
+
+@np.errstate(all="ignore")
+def _judged(model, t, x, p):
+    """Whether states x (n_x, N) with p (n_p, N) reach their manifold, and whether the derivation is valid there."""
+    f = _criterion(model)
+    near, met = f.grid(t, x, p) > 0
+    off = np.flatnonzero(~near)
+    if len(off):
+        t, p = t[off], p[:, off]
+        near[off], met[off] = f.grid(t, on_manifold(model, t, x[:, off], p), p) > 0
+    return near, met
+
+
+def on_manifold(model, t, x, p):
+    """States x (n_x, N) moved to the manifolds of p (n_p,) or (n_p, N), as far as Newton's method does so."""
+    for _ in range(MOVES):
+        *moved, near = _to_manifold(model).grid(t, x, p)
+        if (near > 0).all():
+            break
+        x = np.where(near > 0, x, moved)
+    return x
+
+
+def _criterion(model):
+    """A function of (t, X, p): whether a state is on its manifold, and whether the derivation is valid there."""
+
+    def build():
+        e, r, m, n_x = model.equations, model.reduction, len(model.reduction.full), len(model.state_names)
+        pivots = ca.vertcat(*(pivot for _, pivot in e.all_pivots))
+        least = WEAKER * np.abs(r.points.evaluate(pivots.elements())[0]).min(axis=1, initial=np.inf).astype(float)
+        varied = [ca.depends_on(pivot, e.parameters) for pivot in pivots.elements()]  # others are as they were
+        rounding = ENTRY * ca.vertcat(*sizes_of_terms(pivots.elements())) * ca.DM(varied)
+        highest = e.called(model.function("ode").expression, e.state, e.parameters)[n_x - model.n : n_x]
+        y = e.called(model.function("full").expression, ca.vertcat(e.state, highest), e.parameters)
+        mass = r.mechanism.mass
+        inertia = ca.ldl(ca.sparsify(mass - NEGATIVE * ca.diag(ca.diag(mass))))[0]
+        met = _all(inertia > 0, ca.fabs(pivots) > ca.fmax(least, rounding), ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
+        return compiled(e.function("criterion", e.state, [_near(model)[0], met]), "criterion")
+
+    return model.once("criterion", build)
+
+
+def _to_manifold(model):
+    """A function of (t, X, p): the state after a step to its manifold, and whether it is there before."""
+
+    def build():
+        e, (near, residual, rows, sizes) = model.equations, _near(model)
+        lengths = ca.sqrt(ca.sum2(rows**2))
+        rows = ca.diag(1 / lengths) @ rows
+        step = rows.T @ ca.ldl_solve(residual / lengths, *ca.ldl(rows @ rows.T)) if rows.numel() else 0 * e.state
+        return compiled(e.function("to_manifold", e.state, [e.state - sizes * step, near]), "to_manifold")
+
+    return model.once("to the manifold", build)
+
+
+def _near(model):
+    """Expressions: whether a state is on its manifold, the residuals, their scaled gradients, and usual sizes."""
+    e, m, points, level = model.equations, len(invariant_names(model)), model.reduction.points, model.reduction.top - 1
+    sizes = (points.sizes(level) * points.factorials(level)).astype(float)
+    y = e.called(model.function("invariants").expression, e.state, e.parameters)
+    residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, -1))
+    scales = ca.sqrt(jacobian**2 @ (sizes + ca.fabs(e.state)) ** 2)
+    near = _all(ca.fabs(residual) <= ON_MANIFOLD * ca.if_else(scales > 0, scales, 1))
+    return near, residual, jacobian @ ca.diag(sizes), sizes
+
+
+def _all(*conditions):
+    """Whether all of some columns of conditions are met."""
+    return reduce(ca.logic_and, ca.vertcat(*conditions).elements(), ca.SX(1))
 
 
 def departure(model, t, jets):

@@ -8,20 +8,18 @@ import numpy as np
 
 from servoctl.checks import by_name, distinct, finite, mapping, named, require_kind
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
-from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import (
     Context,
     Points,
-    at_nominal_size,
     follows,
     is_ordinary,
     sample,
     sizes_of_references,
 )
-from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
+from servoctl.reduction.ranks import Rank, clean, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_rows
 from servoctl.reduction.scales import usual
@@ -30,7 +28,7 @@ from servoctl.spec.mechanism import Mechanism, require_known
 from servoctl.spec.packing import Packed
 from servoctl.spec.program import Program
 from servoctl.spec.references import orders_in
-from servoctl.tolerances import ENTRY, TINY
+from servoctl.tolerances import TINY
 from servoctl.values import frozen
 
 NEARBY = 0.01  # s about an instant for which pivots are chosen; at that instant itself entries may vanish by accident
@@ -157,11 +155,6 @@ class Reduction(Packed):
         return desired_balance(self.mechanism, self.program)
 
     @cached_property
-    def flow(self):
-        """The rows along a motion."""
-        return Flow(self.mechanism.q, self.rows, self.top, self.points)
-
-    @cached_property
     def multipliers(self):
         """Multipliers of the reaction, those of the program first, (b,) SX of t, q, γ', γ''."""
         return self.realisation.multipliers(self.balance)
@@ -239,35 +232,6 @@ def references(mechanism, program, further=()):
     of_program = (*program.with_turns.values(), *(e for e in chosen if isinstance(e, ca.SX)))
     named_rows = (*m.constraints.values(), *m.followers.values(), *m.outputs.values(), *m.reported.values())
     return tuple(orders_in(m.q, [*of_program, *named_rows, m.balance, m.energy, m.E, m.q.V, m.q.h, *further]))
-
-
-def holds(reduction, values):
-    """Whether a reduction is valid at other parameters (n_p,) than those at which its ranks were decided.
-
-    At points that satisfy its rows with these parameters, the full equations must hold, ranks must be the same, and no
-    pivot far weaker.
-    """
-    q, r = reduction.mechanism.q, reduction
-    context = replace(r.context, values=values)
-    if r.cascade is None:
-        points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
-    else:
-        points = r.cascade.solved(replace(r.points, values=values), r.top)
-    if not len(points.t):
-        return False
-    for matrix in (r.leading, r.realisation.B.T):
-        numbers = clean(*points.matrix(matrix))
-        if decide(numbers[:, :, 0]).rank < len(numbers):
-            return False
-    before, now = (np.abs(p.evaluate([pivot for _, pivot in r.pivots])[0]) for p in (r.points, points))
-    if not strong(now.min(axis=1), before.min(axis=1)).all():
-        return False
-    full = [*r.full.values()]
-    left, sizes = points.evaluate(full)
-    usual = replace(points, z=at_nominal_size(points.z, points.sizes(points.level), q.nq))
-    sizes = np.maximum(sizes, usual.evaluate(full)[1])  # a velocity that the program keeps at zero is rounding
-    largest = sizes.max(axis=1, keepdims=True)  # as is a length that vanishes at one of the points
-    return bool(np.all(np.abs(left) <= ENTRY * np.maximum(largest, TINY)))
 
 
 def strong(pivots, before):
