@@ -82,7 +82,7 @@ def _criterion(model):
         mass = r.mechanism.mass
         inertia = ca.ldl(ca.sparsify(mass - NEGATIVE * ca.diag(ca.diag(mass))))[0]
         met = _all(inertia > 0, ca.fabs(pivots) > ca.fmax(least, rounding), ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
-        return compiled(e.function("criterion", e.state, [_near(model)[0], met]), "criterion")
+        return compiled(e.function("criterion", e.state, [_distance(model)[0], met]), "criterion")
 
     return model.once("criterion", build)
 
@@ -91,7 +91,7 @@ def _to_manifold(model):
     """A function of (t, X, p): the state after a step to its manifold, and whether it is there before."""
 
     def build():
-        e, (near, residual, rows, sizes) = model.equations, _near(model)
+        e, (near, residual, rows, sizes) = model.equations, _distance(model)
         lengths = ca.sqrt(ca.sum2(rows**2))
         rows = ca.diag(1 / lengths) @ rows
         step = rows.T @ ca.ldl_solve(residual / lengths, *ca.ldl(rows @ rows.T)) if rows.numel() else 0 * e.state
@@ -100,12 +100,12 @@ def _to_manifold(model):
     return model.once("to the manifold", build)
 
 
-def _near(model):
+def _distance(model):
     """Expressions: whether a state is on its manifold, the residuals, their scaled gradients, and usual sizes."""
     e, m, points, level = model.equations, len(invariant_names(model)), model.reduction.points, model.reduction.top - 1
     sizes = (points.sizes(level) * points.factorials(level)).astype(float)
     y = e.called(model.function("invariants").expression, e.state, e.parameters)
-    residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, -1))
+    residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, len(sizes)))
     scales = ca.sqrt(jacobian**2 @ (sizes + ca.fabs(e.state)) ** 2)
     near = _all(ca.fabs(residual) <= ON_MANIFOLD * ca.if_else(scales > 0, scales, 1))
     return near, residual, jacobian @ ca.diag(sizes), sizes

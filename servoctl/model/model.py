@@ -179,7 +179,7 @@ class Model(Detailed):
         current = self.numbers
         changes = by_name(changes, current, "parameter", "The parameters")
         values = r.mechanism.parameters.values({**current, **changes})
-        if not affirmed(self, values[:, None])[0]:
+        if not (np.array_equal(values, self.parameters) or affirmed(self, values[:, None])[0]):
             require_positive(r.mechanism, replace(r.points, values=values))
             self._store.require_unchanged()
             return self._of(r.mechanism, r.program, r.context.guess, None, values).with_references(**self.paths)
