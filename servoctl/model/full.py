@@ -41,13 +41,13 @@ def affirmed(model, values):
         p = with_place(place, values[:, first : first + TOGETHER])
         count = p.shape[1]
         at = np.repeat(t, count), np.repeat(x, count, axis=1), np.tile(p, len(t))
-        near, met = (each.reshape(-1, count) for each in _judged(model, *at))
+        near, met = (each.reshape(-1, count) for each in _examined(model, *at))
         result[first : first + count] = near.any(axis=0) & (met | ~near).all(axis=0)
     return result
 
 
 @np.errstate(all="ignore")
-def _judged(model, t, x, p):
+def _examined(model, t, x, p):
     """Whether states x (n_x, N) with p (n_p, N) reach their manifold, and whether the derivation is valid there."""
     f = _criterion(model)
     near, met = f.grid(t, x, p) > 0
@@ -81,8 +81,8 @@ def _criterion(model):
         y = e.called(model.function("full").expression, ca.vertcat(e.state, highest), e.parameters)
         mass = r.mechanism.mass
         inertia = ca.ldl(ca.sparsify(mass - NEGATIVE * ca.diag(ca.diag(mass))))[0]
-        met = _all(inertia > 0, ca.fabs(pivots) > ca.fmax(least, rounding), ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
-        return compiled(e.function("criterion", e.state, [_distance(model)[0], met]), "criterion")
+        met = _met(inertia > 0, ca.fabs(pivots) > ca.fmax(least, rounding), ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
+        return compiled(e.function("criterion", e.state, [_off(model)[0], met]), "criterion")
 
     return model.once("criterion", build)
 
@@ -91,7 +91,7 @@ def _to_manifold(model):
     """A function of (t, X, p): the state after a step to its manifold, and whether it is there before."""
 
     def build():
-        e, (near, residual, rows, sizes) = model.equations, _distance(model)
+        e, (near, residual, rows, sizes) = model.equations, _off(model)
         lengths = ca.sqrt(ca.sum2(rows**2))
         rows = ca.diag(1 / lengths) @ rows
         step = rows.T @ ca.ldl_solve(residual / lengths, *ca.ldl(rows @ rows.T)) if rows.numel() else 0 * e.state
@@ -100,18 +100,18 @@ def _to_manifold(model):
     return model.once("to the manifold", build)
 
 
-def _distance(model):
+def _off(model):
     """Expressions: whether a state is on its manifold, the residuals, their scaled gradients, and usual sizes."""
     e, m, points, level = model.equations, len(invariant_names(model)), model.reduction.points, model.reduction.top - 1
     sizes = (points.sizes(level) * points.factorials(level)).astype(float)
     y = e.called(model.function("invariants").expression, e.state, e.parameters)
     residual, jacobian = y[:m], ca.sparsify(ca.reshape(y[m:], m, len(sizes)))
     scales = ca.sqrt(jacobian**2 @ (sizes + ca.fabs(e.state)) ** 2)
-    near = _all(ca.fabs(residual) <= ON_MANIFOLD * ca.if_else(scales > 0, scales, 1))
+    near = _met(ca.fabs(residual) <= ON_MANIFOLD * ca.if_else(scales > 0, scales, 1))
     return near, residual, jacobian @ ca.diag(sizes), sizes
 
 
-def _all(*conditions):
+def _met(*conditions):
     """Whether all of some columns of conditions are met."""
     return reduce(ca.logic_and, ca.vertcat(*conditions).elements(), ca.SX(1))
 
