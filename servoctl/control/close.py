@@ -231,7 +231,7 @@ def _of_same_orders(run):
         return z
 
     points = np.vstack([run.states, np.nan_to_num(run.p)])
-    names = [*plant.mechanism.constraints]
+    names = [*plant.equations.written, *plant.equations.omitted]
     k, row = first_departure(names, lambda t, z: full.grid(t, z[:n_x], z[n_x:]), run.t, points, restored)
     if k is None:
         return run

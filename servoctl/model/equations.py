@@ -311,9 +311,11 @@ class Equations(Invariants):
 
     def full(self):
         """The full equations as they are written, by `sized`, of (t, Z, p)."""
-        values, first = [self._without_higher(e) for e in self.r.full.values()], self.q.nq
+        first, parts = self.q.nq, (self.r.full, self.r.omitted)
+        terms = self.points.evaluate([self.r.full[name] for name in self.r.omitted])[1].max(axis=1, initial=0.0)
         usual = (self.points.sizes(self.top) * self.points.factorials(self.top))[first:]
-        return self.function("full", self.jets, sized(values, self.jets[first:], usual))
+        parts = ({name: self._without_higher(e) for name, e in part.items()} for part in parts)
+        return self.function("full", self.jets, sized(*parts, terms, self.jets[first:], usual))
 
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
@@ -466,10 +468,18 @@ SIGNALS = {  # names and expressions of each group
 }
 
 
-def sized(values, rates, usual):
-    """Expressions, the sizes of their terms, and these sizes where `rates` have at least their usual sizes."""
-    sizes = ca.vertcat(ca.SX(0, 1), *sizes_of_terms(values))
-    return [*values, sizes, ca.substitute(sizes, rates, ca.if_else(ca.fabs(rates) < usual, usual, rates))]
+def sized(written, omitted, terms, rates, usual):
+    """Equations by name, and what rows omit of them: values, sizes of their terms, and sizes at usual rates.
+
+    At usual rates `rates` have at least their usual sizes. What is omitted is taken there, beside no less than usual
+    `terms` of its equation: a row takes another order also where its motion rests.
+    """
+    sizes = dict(zip(written, sizes_of_terms(list(written.values())), strict=True))
+    columns = (omitted, {name: sizes[name] for name in omitted}, sizes)
+    columns = [ca.vertcat(ca.SX(0, 1), *column.values()) for column in columns]
+    out, of_out, at_usual = ca.substitute(columns, [rates], [ca.if_else(ca.fabs(rates) < usual, usual, rates)])
+    of_out = ca.fmax(of_out, ca.DM(terms.astype(float)))
+    return [*written.values(), out, *sizes.values(), of_out, at_usual, of_out]
 
 
 def _level_name(name, j):

@@ -12,7 +12,6 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.errors import SingularProgram
-from servoctl.jets.branches import sizes_of_terms
 from servoctl.model.equations import invariant_names
 from servoctl.model.points import place_of, with_place
 from servoctl.reduction.appell import NEGATIVE
@@ -60,11 +59,12 @@ def _examined(model, t, x, p):
 
 def on_manifold(model, t, x, p):
     """States x (n_x, N) moved to the manifolds of p (n_p,) or (n_p, N), as far as Newton's method does so."""
+    there = np.zeros(len(t), bool)
     for _ in range(MOVES):
         *moved, near = _to_manifold(model).grid(t, x, p)
-        if (near > 0).all():
+        x, there = np.where(there, x, moved), there | (near > 0)  # one step more leaves rounding
+        if there.all():
             break
-        x = np.where(near > 0, x, moved)
     return x
 
 
@@ -72,16 +72,14 @@ def _criterion(model):
     """A function of (t, X, p): whether a state is on its manifold, and whether the derivation is valid there."""
 
     def build():
-        e, r, m, n_x = model.equations, model.reduction, len(model.reduction.full), len(model.state_names)
+        e, r, n_x = model.equations, model.reduction, len(model.state_names)
         pivots = ca.vertcat(*(pivot for _, pivot in e.all_pivots))
-        least = WEAKER * np.abs(r.points.evaluate(pivots.elements())[0]).min(axis=1, initial=np.inf).astype(float)
-        varied = [ca.depends_on(pivot, e.parameters) for pivot in pivots.elements()]  # others are as they were
-        rounding = ENTRY * ca.vertcat(*sizes_of_terms(pivots.elements())) * ca.DM(varied)
+        least = np.abs(r.points.evaluate(pivots.elements())[0]).min(axis=1, initial=np.inf).astype(float)
         highest = e.called(model.function("ode").expression, e.state, e.parameters)[n_x - model.n : n_x]
         y = e.called(model.function("full").expression, ca.vertcat(e.state, highest), e.parameters)
-        mass = r.mechanism.mass
+        mass, m = r.mechanism.mass, y.numel() // 3
         inertia = ca.ldl(ca.sparsify(mass - NEGATIVE * ca.diag(ca.diag(mass))))[0]
-        met = _met(inertia > 0, ca.fabs(pivots) > ca.fmax(least, rounding), ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
+        met = _met(inertia > 0, ca.fabs(pivots) > WEAKER * least, ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
         return compiled(e.function("criterion", e.state, [_off(model)[0], met]), "criterion")
 
     return model.once("criterion", build)
@@ -127,13 +125,14 @@ def departure(model, t, jets):
         x = on_manifold(model, t, z[:n_x], p)
         return np.vstack([x, model.function("ode").grid(t, x, p)[n_x - model.n : n_x]])
 
-    return first_departure([*model.reduction.full], lambda t, z: f.grid(t, z, p), t, jets[: f.n_x], restored)
+    names = [*model.reduction.full, *model.reduction.omitted]
+    return first_departure(names, lambda t, z: f.grid(t, z, p), t, jets[: f.n_x], restored)
 
 
 def first_departure(names, full, t, z, restored):
     """The same for points z (n_z, N), from functions of times and points.
 
-    `full` gives what `equations.sized` has of each equation; `restored` are the points on the constraint manifold.
+    `full` gives what `equations.sized` has of the equations, `restored` the points on the constraint manifold.
     """
     known = np.flatnonzero(np.isfinite(z).all(axis=0))
     t, z = t[known], z[:, known]

@@ -15,7 +15,7 @@ from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context, follows, sample
 from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, references, strong
-from servoctl.reduction.rows import as_rows
+from servoctl.reduction.rows import as_rows, omitted
 from servoctl.spec.program import no_program
 from servoctl.spec.references import Jets, called, function_of
 from servoctl.tolerances import ENTRY, TINY
@@ -68,10 +68,14 @@ class PlantEquations:
     @cached_property
     def _material(self):
         """Rows of the material constraints, which have full rank, and points of their manifold."""
-        m, context = self.mechanism, self._context
-        rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
-        require_inertia(m, rows, points)
+        rows, _, points, _ = complete(self.q, self._original, self._context)
+        require_inertia(self.mechanism, rows, points)
         return rows, points
+
+    @cached_property
+    def _original(self):
+        """The rows of the material constraints by themselves."""
+        return as_rows(self.q, self.mechanism.constraints, "material", self._context)
 
     def near(self, t, x, values, followed):
         """The same equations with orders and pivots decided near a state x (n_x,) at t [s], with these parameters.
@@ -149,18 +153,27 @@ class PlantEquations:
     @property
     def rests(self):
         """Whether the order of a material constraint rests on slopes that may be active elsewhere."""
-        return any(row.rests for row in self._material[0])
+        return any(row.rests for row in (*self._original, *self._material[0]))
 
     @cached_property
-    def _written(self):
-        """The material constraints as they are written."""
-        return [self.q.on_spheres(e) for e in self.mechanism.constraints.values()]
+    def written(self):
+        """The material constraints as they are written, by name."""
+        return {name: self.q.on_spheres(e) for name, e in self.mechanism.constraints.items()}
+
+    @property
+    def omitted(self):
+        """What their rows leave out, where it may be active elsewhere, by name."""
+        return omitted(self.written, self._original)
 
     def full(self):
         """The material constraints as they are written, by `sized`."""
-        values = ca.substitute(self._written, [ca.vertcat(*self.q.gamma(2))], [self.acceleration])
-        usual = self._material[1].sizes(1)[self.q.nq :]
-        return self.function("full", sized(values, self.velocity, usual))
+        highest, points = ca.vertcat(*self.q.gamma(2)), self._material[1]
+        terms = points.evaluate([self.written[name] for name in self.omitted])[1].max(axis=1, initial=0.0)
+        parts = (
+            {name: ca.substitute(e, highest, self.acceleration) for name, e in part.items()}
+            for part in (self.written, self.omitted)
+        )
+        return self.function("full", sized(*parts, terms, self.velocity, points.sizes(1)[self.q.nq :]))
 
     def hold(self, values):
         """Whether orders and pivots may stay as they are with other parameters (n_p,) or (n_p, N)."""
@@ -176,7 +189,7 @@ class PlantEquations:
         """Whether the material constraints hold as they are written where their rows do with other parameters."""
         rows, points = self._material
         points = sample(self.q, rows, 2, Context(points.parameters, values, WINDOW, {}), starts=points)
-        left, sizes = points.evaluate(self._written)
+        left, sizes = points.evaluate([*self.written.values()])
         return bool(np.all(np.abs(left) <= ENTRY * sizes))
 
     @cached_property

@@ -21,7 +21,7 @@ from servoctl.reduction.manifold import (
 )
 from servoctl.reduction.ranks import Rank, clean, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
-from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, settle_rows
+from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, omitted, settle_rows
 from servoctl.reduction.scales import usual
 from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -148,6 +148,11 @@ class Reduction(Packed):
         m, left = self.mechanism, self.balance - self.realisation.B @ self.multipliers
         rows = {name: m.q.on_spheres(e) for name, e in {**self.program.residuals, **m.constraints}.items()}
         return rows | {f"balance of {name}": e for name, e in zip(m.q.force_names, left.elements(), strict=True)}
+
+    @property
+    def omitted(self):
+        """What the rows of the designer leave out of the full equations, where it may be active elsewhere, by name."""
+        return omitted(self.full, self.original.values())
 
     @cached_property
     def balance(self):

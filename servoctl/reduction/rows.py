@@ -87,6 +87,11 @@ def balances(q, expressions):
     ]
 
 
+def omitted(written, rows):
+    """What rows leave out of equations as they are written, where their orders rest on slopes: SX by name."""
+    return {row.name: written[row.name] - row.expression for row in rows if row.rests}
+
+
 def merge_uses(*parts):
     """The highest number of differentiations of each residual among (uses, extra differentiations) pairs."""
     total = {}
