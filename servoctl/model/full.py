@@ -28,7 +28,7 @@ def affirmed(model, values):
     """For which parameters (n_p, C) a derivation is certainly valid, (C,) array of bool.
 
     That is so where the points at which ranks were decided, as far as they reach the manifold of these parameters,
-    satisfy the full equations there, with a positive inertia, and pivots are neither rounding nor far weaker.
+    satisfy the full equations there, with a positive inertia and no pivot far weaker.
     """
     points, result = model.reduction.points, np.zeros(values.shape[1], bool)
     place = place_of(model, [_criterion(model), _to_manifold(model)])
@@ -45,7 +45,6 @@ def affirmed(model, values):
     return result
 
 
-@np.errstate(all="ignore")
 def _examined(model, t, x, p):
     """Whether states x (n_x, N) with p (n_p, N) reach their manifold, and whether the derivation is valid there."""
     f = _criterion(model)
