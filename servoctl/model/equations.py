@@ -311,11 +311,10 @@ class Equations(Invariants):
 
     def full(self):
         """The full equations as they are written, by `sized`, of (t, Z, p)."""
-        first, parts = self.q.nq, (self.r.full, self.r.omitted)
-        terms = self.points.evaluate([self.r.full[name] for name in self.r.omitted])[1].max(axis=1, initial=0.0)
-        usual = (self.points.sizes(self.top) * self.points.factorials(self.top))[first:]
+        parts = (self.r.full, self.r.omitted)
         parts = ({name: self._without_higher(e) for name, e in part.items()} for part in parts)
-        return self.function("full", self.jets, sized(*parts, terms, self.jets[first:], usual))
+        usual = self.points.sizes(self.top) * self.points.factorials(self.top)
+        return self.function("full", self.jets, sized(*parts, self.jets, usual, self.q.nq))
 
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
@@ -468,18 +467,22 @@ SIGNALS = {  # names and expressions of each group
 }
 
 
-def sized(written, omitted, terms, rates, usual):
-    """Equations by name, and what rows omit of them: values, sizes of their terms, and sizes at usual rates.
+def sized(written, omitted, jets, usual, nq):
+    """Equations by name, and what rows omit of them: values, sizes of their terms, and these at jets of usual size.
 
-    At usual rates `rates` have at least their usual sizes. What is omitted is taken there, beside no less than usual
-    `terms` of its equation: a row takes another order also where its motion rests.
+    There rates, the jets behind the nq coordinates, have at least their usual sizes, and an equation without rates has
+    the change that usual coordinates make. What is omitted is taken there, too: a row takes another order also where
+    its motion rests.
     """
-    sizes = dict(zip(written, sizes_of_terms(list(written.values())), strict=True))
-    columns = (omitted, {name: sizes[name] for name in omitted}, sizes)
-    columns = [ca.vertcat(ca.SX(0, 1), *column.values()) for column in columns]
-    out, of_out, at_usual = ca.substitute(columns, [rates], [ca.if_else(ca.fabs(rates) < usual, usual, rates)])
-    of_out = ca.fmax(of_out, ca.DM(terms.astype(float)))
-    return [*written.values(), out, *sizes.values(), of_out, at_usual, of_out]
+    q, rates, names = jets[:nq], jets[nq:], [*written]
+    sizes, out = (ca.vertcat(ca.SX(0, 1), *part) for part in (sizes_of_terms([*written.values()]), omitted.values()))
+    moving = ca.if_else(ca.fabs(rates) < usual[nq:], usual[nq:], rates)
+    at_usual, out = ca.substitute([sizes, out], [rates], [moving])
+    for i, (name, equation) in enumerate(written.items()):
+        if name in omitted or not ca.depends_on(equation, rates):
+            at_usual[i] += ca.fabs(ca.jacobian(equation, q)) @ usual[:nq]
+    of_out = at_usual[[names.index(name) for name in omitted]]
+    return [*written.values(), out, sizes, of_out, at_usual, of_out]
 
 
 def _level_name(name, j):

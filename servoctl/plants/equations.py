@@ -167,13 +167,12 @@ class PlantEquations:
 
     def full(self):
         """The material constraints as they are written, by `sized`."""
-        highest, points = ca.vertcat(*self.q.gamma(2)), self._material[1]
-        terms = points.evaluate([self.written[name] for name in self.omitted])[1].max(axis=1, initial=0.0)
+        highest, jets = ca.vertcat(*self.q.gamma(2)), ca.vertcat(*self.q, self.velocity)
         parts = (
             {name: ca.substitute(e, highest, self.acceleration) for name, e in part.items()}
             for part in (self.written, self.omitted)
         )
-        return self.function("full", sized(*parts, terms, self.velocity, points.sizes(1)[self.q.nq :]))
+        return self.function("full", sized(*parts, jets, self._material[1].sizes(1), self.q.nq))
 
     def hold(self, values):
         """Whether orders and pivots may stay as they are with other parameters (n_p,) or (n_p, N)."""
