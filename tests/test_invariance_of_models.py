@@ -9,7 +9,7 @@ import pytest
 from conftest import derived_alike, motion, signal
 
 import servoctl as sv
-from servoctl.errors import ServoError, SingularProgram
+from servoctl.errors import InconsistentStart, ServoError, SingularProgram
 from servoctl.gallery import gallery, mass_on_car, overhead_crane, winch_crane
 from servoctl.model.full import affirmed
 from servoctl.model.model import Model, derive
@@ -345,6 +345,12 @@ def test_what_is_affirmed_is_what_a_derivation_with_these_numbers_gives(name):
                     assert derived_alike(model, values)
                 both += 1
     assert both >= 5
+
+
+def test_a_number_at_which_a_row_has_a_pole_is_refused(gallery_model):
+    """A robot that follows a clothoid at speed zero: its rows divide by the speed, and hold wherever v/v is one."""
+    with pytest.raises(InconsistentStart):
+        gallery_model("wheeled-robot").with_parameters(speed=0.0)
 
 
 @pytest.mark.parametrize(("name", "change"), [("no friction", {"c": 0.7}), ("horizontal", {"alpha": 0.3})])

@@ -28,7 +28,7 @@ def affirmed(model, values):
     """For which parameters (n_p, C) a derivation is certainly valid, (C,) array of bool.
 
     That is so where the points at which ranks were decided, as far as they reach the manifold of these parameters,
-    satisfy the full equations there, with a positive inertia and no pivot far weaker.
+    satisfy the full equations there, with a positive inertia and no pivot far weaker or, as at a pole, stronger.
     """
     points, result = model.reduction.points, np.zeros(values.shape[1], bool)
     place = place_of(model, [_criterion(model), _to_manifold(model)])
@@ -73,12 +73,14 @@ def _criterion(model):
     def build():
         e, r, n_x = model.equations, model.reduction, len(model.state_names)
         pivots = ca.vertcat(*(pivot for _, pivot in e.all_pivots))
-        least = np.abs(r.points.evaluate(pivots.elements())[0]).min(axis=1, initial=np.inf).astype(float)
+        before = np.abs(r.points.evaluate(pivots.elements())[0]).astype(float)
+        least, most = before.min(axis=1, initial=np.inf), before.max(axis=1, initial=0.0)
         highest = e.called(model.function("ode").expression, e.state, e.parameters)[n_x - model.n : n_x]
         y = e.called(model.function("full").expression, ca.vertcat(e.state, highest), e.parameters)
         mass, m = r.mechanism.mass, y.numel() // 3
         inertia = ca.ldl(ca.sparsify(mass - NEGATIVE * ca.diag(ca.diag(mass))))[0]
-        met = _met(inertia > 0, ca.fabs(pivots) > WEAKER * least, ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
+        kept = ca.fabs(pivots) > WEAKER * least, WEAKER * ca.fabs(pivots) < most
+        met = _met(inertia > 0, *kept, ca.fabs(y[:m]) <= ENTRY * y[2 * m :])
         return compiled(e.function("criterion", e.state, [_off(model)[0], met]), "criterion")
 
     return model.once("criterion", build)
