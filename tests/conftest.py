@@ -25,7 +25,9 @@ from scenes import CRANE, CRANE_PROGRAM, POINT, POINT_PROGRAM
 import servoctl as sv
 from servoctl.codegen import compiler, function
 from servoctl.gallery import gallery
+from servoctl.model.full import on_manifold
 from servoctl.model.model import derive
+from servoctl.model.points import place_of, with_place
 from servoctl.model.variants import derived_near
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
@@ -188,6 +190,19 @@ def signal(model, kind, t, jets):
     """A group of signals by name at one instant."""
     names, function = model.signals(kind)
     return dict(zip(names, function(t, jets, model.p), strict=True))
+
+
+def derived_alike(model, values):
+    """Whether a derivation with parameters (n_p,) has the same orders, and the model the rates that it gives."""
+    r = model.reduction
+    own = model._of(r.mechanism, r.program, r.context.guess, None, values)
+    if sorted(row.order for row in own.reduction.rows) != sorted(row.order for row in r.rows):
+        return False
+    points, functions = own.reduction.points, [m.function("ode") for m in (model, own)]
+    t, p = points.t.astype(float), with_place(place_of(own, functions), values)
+    x = on_manifold(own, t, np.vstack([points.jet(k) for k in range(r.top)]).astype(float), p)
+    here, there = (f.grid(t, x, p)[: len(x)] for f in functions)
+    return bool(np.all(np.abs(here - there) <= 1e-6 * (1.0 + np.abs(there))))
 
 
 # tiers ---------------------------------------------------------------------------------------------------------------

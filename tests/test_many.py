@@ -7,17 +7,16 @@ from multiprocessing import get_context
 from threading import Thread
 
 import casadi as ca
-import conftest  # noqa: F401 - workers compile as tests do
 import numpy as np
 import pytest
+from conftest import derived_alike  # workers compile as tests do
 from refusals import refused
 
 import servoctl as sv
 from servoctl.errors import NameUnknown, ServoError, SpecificationError
 from servoctl.gallery import gallery
 from servoctl.methods import lanes
-from servoctl.model.validity import affirmed, affirmed_each
-from servoctl.reduction.reduce import holds
+from servoctl.model.full import affirmed
 from servoctl.simulation import simulated
 
 SEED = 4
@@ -270,7 +269,7 @@ def test_what_stays_constant_keeps_the_derivation(height, quasi):
     model = held_pendulum(lambda q, p: ca.sin(p.f * q.t), quasi, height)
     values = model.parameters.copy()
     values[[*model.numbers].index("r")] = 1.3
-    assert affirmed(model, values) and holds(model.reduction, values)
+    assert affirmed(model, values[:, None]).all() and derived_alike(model, values)
     assert model.with_parameters(r=1.3).reduction is model.reduction
     with refused(SpecificationError):
         model.with_parameters(m=-1.0)
@@ -376,18 +375,18 @@ def test_derivations_are_affirmed_for_each_set_of_parameters_by_itself(gallery_m
     values = np.tile(model.parameters[:, None], 7)
     values[names.index("M")] = [5.0, 4.0, -50.0, np.nan, 6.0, 1e-3, 5.5]
     values[names.index("b"), 4] = 0.0
-    found = affirmed_each(model, values)
+    found = affirmed(model, values)
     assert found.tolist() == [True, True, False, False, found[4], found[5], True]
-    assert found.tolist() == [affirmed(model, column) for column in values.T]
+    assert found.tolist() == [affirmed(model, column[:, None])[0] for column in values.T]
     for column in values[:, found].T:
-        assert holds(model.reduction, column)
+        assert derived_alike(model, column)
 
 
 @pytest.mark.parametrize(
     "name", ["appell-hamel", "overhead-crane", "winch-crane", "mass-on-car", "wheeled-robot", "four-bar"]
 )
 def test_derivations_are_affirmed_at_once_where_they_hold(name, gallery_model):
-    """Parameters of the balances, of the constraints, and of both; what is plainly valid holds in extended precision."""
+    """Parameters of the balances, of the constraints, and of both; what is affirmed is what a derivation gives."""
     model, rng = gallery_model(name), np.random.default_rng(SEED)
     columns = np.tile(model.parameters[:, None], 12 * len(model.numbers))
     factors = np.append(rng.uniform(0.5, 2.0, 7), [0.0, 1e-9, 1e3, -1.0, np.nan])
@@ -395,11 +394,9 @@ def test_derivations_are_affirmed_at_once_where_they_hold(name, gallery_model):
         columns[k, 12 * k : 12 * k + 12] *= factors
     both = model.parameters[:, None] * rng.uniform(0.9, 1.1, (len(model.numbers), 20))
     for values in (*np.split(columns, len(model.numbers), axis=1), both):
-        found = affirmed_each(model, values)
-        alone = np.array([affirmed(model, column) for column in values.T])
-        assert not (alone & ~found).any()
-        assert all(holds(model.reduction, column) for column in values[:, found & ~alone].T)
-        assert all(holds(model.reduction, column) for column in values[:, found][:, -2:].T)
+        found = affirmed(model, values)
+        assert found.tolist() == [affirmed(model, column[:, None])[0] for column in values.T]
+        assert all(derived_alike(model, column) for column in values[:, found][:, -2:].T)
     assert found.sum() > 10
 
 

@@ -6,8 +6,8 @@ import pytest
 import referred
 
 import servoctl as sv
+from servoctl.model.full import affirmed
 from servoctl.model.model import Model
-from servoctl.model.validity import affirmed_each
 
 
 def tip(formula):
@@ -32,7 +32,7 @@ def affirmed_by_both(make):
     old, new = make(formula=True), make(formula=False)
     values = new.parameters[:, None] * np.random.default_rng(3).uniform(0.5, 1.5, (len(new.parameters), 40))
     values[0, :3] = 0.0, -1.0, 1e-9
-    return affirmed_each(old, values), affirmed_each(new, values)
+    return affirmed(old, values), affirmed(new, values)
 
 
 @pytest.mark.parametrize("make", [referred.crane, referred.cart])
@@ -48,9 +48,9 @@ def test_links_that_reach_no_point_of_theirs_are_not_affirmed():
 
 
 @pytest.mark.parametrize("make", [referred.crane, tip])
-def test_other_parameters_need_no_extended_precision(make, monkeypatch):
+def test_other_parameters_need_no_other_derivation(make, monkeypatch):
     model = make(formula=False)
-    monkeypatch.setattr(Model, "_holds", lambda *_: pytest.fail("decided in extended precision"))
+    monkeypatch.setattr(Model, "_of", lambda *_: pytest.fail("derived again"))
     name = list(model.numbers)[0]
     other = model.with_parameters(**{name: 1.1 * model.numbers[name]})
     assert other.reduction is model.reduction and np.array_equal(other.p[1:], other.parameters)

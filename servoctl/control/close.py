@@ -14,8 +14,8 @@ from servoctl.control.loop import FINISHED, INTERRUPTED, LAW_LOST, STATE_LOST, L
 from servoctl.control.reference import Reference, of_plan, require_plan, require_plant
 from servoctl.control.result import Closed
 from servoctl.errors import InconsistentStart, IntegrationStopped, ServoError, SpecificationError
+from servoctl.model.full import first_departure, other_order
 from servoctl.plants.plant import Plant
-from servoctl.reduction.orders import other_order
 from servoctl.run import Run
 
 CONSISTENT = 1e-6  # of the state: the largest residual of a material constraint at the start
@@ -221,9 +221,18 @@ def finished(plant, law, plan, loop, conditions, advance=None):
 
 def _of_same_orders(run):
     """The loop, if its material constraints have the same orders at all of its samples."""
-    equations = run.plant.equations
-    states, values = run.states[: len(run.states) - len(run.plant.lag)], run.plant.parameters[: len(equations.values)]
-    k, row = equations.orders.first_change(run.t, states, values)
+    plant = run.plant
+    if not plant.equations.rests:
+        return run
+    full, project, n_x = plant.function("full"), plant.function("project"), plant.n_x
+
+    def restored(t, z):
+        z[:n_x] += project.grid(t, z[:n_x], z[n_x:])
+        return z
+
+    points = np.vstack([run.states, np.nan_to_num(run.p)])
+    names = [*plant.equations.written, *plant.equations.omitted]
+    k, row = first_departure(names, lambda t, z: full.grid(t, z[:n_x], z[n_x:]), run.t, points, restored)
     if k is None:
         return run
     error = other_order(row, float(run.t[k]))

@@ -80,7 +80,7 @@ def fits(model):
     def smooth():
         f = model.function("ode").expression
         inputs = f.sx_in()
-        alone = not model.reduction.orders and switching(model) is None and not _steep(model)
+        alone = not model.reduction.rests and switching(model) is None and not _steep(model)
         return alone and not ca.depends_on(f(*inputs), inputs[0])
 
     return not (model.flat or model.paths) and model.once("fits lanes", smooth)
@@ -128,7 +128,7 @@ def plans_fit(model):
 
     def quiet():
         r = model.reduction
-        return r.cascade is None and not (r.orders or switched(r))
+        return r.cascade is None and not (r.rests or switched(r))
 
     return model.flat and model.once("plans fit", quiet)
 

@@ -16,9 +16,8 @@ from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
 from servoctl.methods.pieces import DEFAULT, End, Tolerance
 from servoctl.methods.sizes import from_start
 from servoctl.methods.switches import Switches, no_model, sticks
-from servoctl.model.following import instants_of
+from servoctl.model.full import departure, other_order
 from servoctl.model.variants import derived_near
-from servoctl.reduction.orders import other_order
 
 CHATTERS, CHATTERS_IN = 100, 1e-3  # switches in this part of the span: the motion stays on one, as after ever less time
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
@@ -162,9 +161,7 @@ class Motion:
     def end_where_orders_change(self):
         """Stop before the first sample at which a row has another order than the one that it was derived with."""
         for model, t, jets in self.by_piece():
-            if not model.reduction.orders:  # which rest on no slope
-                continue
-            k, name = model.reduction.orders.first_change(instants_of(model, t), jets, model.parameters)
+            k, name = departure(model, t, jets) if model.reduction.rests else (None, "")
             if k is not None:
                 at = float(t[k])
                 try:

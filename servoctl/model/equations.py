@@ -8,7 +8,7 @@ import numpy as np
 from servoctl.checks import distinct
 from servoctl.codegen.paths import combined
 from servoctl.errors import SpecificationError
-from servoctl.jets.branches import size_of_terms
+from servoctl.jets.branches import size_of_terms, sizes_of_terms
 from servoctl.model import saddle
 from servoctl.reduction.definite import Definite
 from servoctl.reduction.ranks import clean, column_sizes, eliminate
@@ -180,11 +180,6 @@ class Equations(Invariants):
         """Pivots that depend on the motion, which must not vanish: a list of (name, SX)."""
         return [(name, p) for name, p in self.all_pivots if any(self.q.where(s) is not None for s in ca.symvar(p))]
 
-    def constant_pivots(self):
-        """A function of the parameters: the pivots that depend on these alone."""
-        constant = [p for _, p in self.all_pivots if all(self.q.where(s) is None for s in ca.symvar(p))]
-        return ca.Function("constant_pivots", [self.parameters], [ca.vertcat(*constant)])
-
     @property
     def pivot_sizes(self):
         """Largest size of each pivot at the points where the pivots were chosen, (n_g,) array."""
@@ -313,6 +308,13 @@ class Equations(Invariants):
         sums = ca.vertcat(*map(size_of_terms, left.elements())) + ca.fabs(of_program) @ ca.fabs(wanted)
         largest = reduce(ca.fmax, map(ca.fabs, terms))
         return self.function("balanced", ca.vertcat(self.jets, inputs, wanted, reactions), [left, largest, sums])
+
+    def full(self):
+        """The full equations as they are written, by `sized`, of (t, Z, p)."""
+        parts = (self.r.full, self.r.omitted)
+        parts = ({name: self._without_higher(e) for name, e in part.items()} for part in parts)
+        usual = self.points.sizes(self.top) * self.points.factorials(self.top)
+        return self.function("full", self.jets, sized(*parts, self.jets, usual, self.q.nq))
 
     def signals(self, kind, rate=0):
         """Names of a group of `SIGNALS`, and their `rate`-th time derivatives as a function of (t, Z, p).
@@ -447,6 +449,7 @@ EQUATIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "invariants": lambda e: (e.invariants(),),
     "matrices": lambda e: (e.matrices(),),
     "balanced": lambda e: (e.balanced(),),
+    "full": lambda e: (e.full(),),
     "accelerations": lambda e: (saddle.accelerations(e),),
 }
 
@@ -467,6 +470,24 @@ SIGNALS = {  # names and expressions of each group
     "power": Equations._power,
     "reach": Equations._reach,
 }
+
+
+def sized(written, omitted, jets, usual, nq):
+    """Equations by name, and what rows omit of them: values, sizes of their terms, and these at jets of usual size.
+
+    There rates, the jets behind the nq coordinates, have at least their usual sizes, and an equation without rates has
+    the change that usual coordinates make. What is omitted is taken there, too: a row takes another order also where
+    its motion rests.
+    """
+    q, rates, names = jets[:nq], jets[nq:], [*written]
+    sizes, out = (ca.vertcat(ca.SX(0, 1), *part) for part in (sizes_of_terms([*written.values()]), omitted.values()))
+    moving = ca.if_else(ca.fabs(rates) < usual[nq:], usual[nq:], rates)
+    at_usual, out = ca.substitute([sizes, out], [rates], [moving])
+    for i, (name, equation) in enumerate(written.items()):
+        if name in omitted or not ca.depends_on(equation, rates):
+            at_usual[i] += ca.fabs(ca.jacobian(equation, q)) @ usual[:nq]
+    of_out = at_usual[[names.index(name) for name in omitted]]
+    return [*written.values(), out, sizes, of_out, at_usual, of_out]
 
 
 def _level_name(name, j):

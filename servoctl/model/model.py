@@ -16,17 +16,17 @@ from servoctl.errors import ServoError, SpecificationError
 from servoctl.markup import Detailed
 from servoctl.model.equations import EQUATIONS, SIGNALS, Equations
 from servoctl.model.following import instants_of, p_with
+from servoctl.model.full import affirmed
 from servoctl.model.jets import jet_names_to
 from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
-from servoctl.model.validity import affirmed, points_with
 from servoctl.model.variants import form_of, place_of
 from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
-from servoctl.reduction.reduce import holds, reduce, require_parts, strong
+from servoctl.reduction.reduce import reduce, require_parts
 from servoctl.reduction.structure import structure
 from servoctl.spec.mechanism import Mechanism
 from servoctl.spec.program import Program
@@ -179,11 +179,10 @@ class Model(Detailed):
         current = self.numbers
         changes = by_name(changes, current, "parameter", "The parameters")
         values = r.mechanism.parameters.values({**current, **changes})
-        if not affirmed(self, values):
+        if not (np.array_equal(values, self.parameters) or affirmed(self, values[:, None])[0]):
             require_positive(r.mechanism, replace(r.points, values=values))
-            if not self._holds(values):
-                self._store.require_unchanged()
-                return self._of(r.mechanism, r.program, r.context.guess, None, values).with_references(**self.paths)
+            self._store.require_unchanged()
+            return self._of(r.mechanism, r.program, r.context.guess, None, values).with_references(**self.paths)
         return Model(r, self._store, values, self._functions, paths=self.paths)
 
     def with_references(self, **paths) -> "Model":
@@ -227,14 +226,6 @@ class Model(Detailed):
     def p(self):
         """The parameters of compiled functions: those of the model, after the place of the paths that it follows."""
         return read_only(p_with(self, self.parameters)) if self.paths else self.parameters
-
-    def _holds(self, values):
-        """Whether every decision of the derivation is the same with other parameters."""
-        return holds(self.reduction, values) and self._constant_pivots_hold(values)
-
-    def _constant_pivots_hold(self, values):
-        f = self.once("constant pivots", lambda: self.equations.constant_pivots())
-        return bool(strong(*(f(p).full() for p in (values, self.reduction.context.values))).all())
 
     @property
     def numbers(self):
@@ -308,7 +299,7 @@ class Model(Detailed):
         ----------
         name : str
             "ode", "ode_projected", "ode_poles", "ode_jacobian", "ode_poles_jacobian", "path", "invariants",
-            "matrices", "balanced", or "accelerations".
+            "matrices", "balanced", "full", or "accelerations".
 
         Returns
         -------
@@ -339,11 +330,6 @@ class Model(Detailed):
             return names, compiled(f, f.name())
 
         return self.once(f"signals {kind}{rate or ''}", build)
-
-    @cached_property
-    def _rank_points(self):
-        """States (n_x, points) at which ranks were decided, with the model's own parameters."""
-        return points_with(self)
 
     def feedforward(self, start: State, rate: float = 1000.0) -> "Feedforward":
         """Forces along references that arrive in samples: `step = model.feedforward(start)`, then `step(jets)`.

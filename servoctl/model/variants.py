@@ -11,6 +11,7 @@ import numpy as np
 from servoctl.errors import ServoError, SingularProgram, SpecificationError
 from servoctl.model import saddle
 from servoctl.model.following import instants_of
+from servoctl.model.full import affirmed
 from servoctl.model.pivots import pivot_strength
 from servoctl.reduction.definite import Definite, definite
 from servoctl.reduction.manifold import references_at
@@ -84,7 +85,7 @@ def _serves(base, near, t, jets):
     """Whether a variant that was derived near another state, or with other parameters, is as good at these jets."""
     strong = pivot_strength(base._with(near), t, jets) > STRONG
     same = np.array_equal(base.parameters, near.reduction.context.values)
-    return strong and near.free == base.free and (same or near._holds(base.parameters))
+    return strong and near.free == base.free and (same or affirmed(near, base.parameters[:, None])[0])
 
 
 def with_diagonal_pivots(model):

@@ -10,16 +10,15 @@ import numpy as np
 from servoctl.codegen.folding import folded
 from servoctl.codegen.interpreted import Interpreter
 from servoctl.errors import SpecificationError
-from servoctl.model.equations import Invariants
+from servoctl.model.equations import Invariants, sized
 from servoctl.reduction.appell import plant_solution, require_inertia
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import Context, follows, sample
-from servoctl.reduction.orders import Orders
 from servoctl.reduction.reduce import NEAR_SPREAD, NEARBY, WINDOW, references, strong
-from servoctl.reduction.rows import as_rows
+from servoctl.reduction.rows import as_rows, omitted
 from servoctl.spec.program import no_program
 from servoctl.spec.references import Jets, called, function_of
-from servoctl.tolerances import TINY
+from servoctl.tolerances import ENTRY, TINY
 from servoctl.values import Identity
 
 LATEST = 32  # plants whose equations stay in memory
@@ -69,10 +68,14 @@ class PlantEquations:
     @cached_property
     def _material(self):
         """Rows of the material constraints, which have full rank, and points of their manifold."""
-        m, context = self.mechanism, self._context
-        rows, _, points, _ = complete(self.q, as_rows(self.q, m.constraints, "material", context), context)
-        require_inertia(m, rows, points)
+        rows, _, points, _ = complete(self.q, self._original, self._context)
+        require_inertia(self.mechanism, rows, points)
         return rows, points
+
+    @cached_property
+    def _original(self):
+        """The rows of the material constraints by themselves."""
+        return as_rows(self.q, self.mechanism.constraints, "material", self._context)
 
     def near(self, t, x, values, followed):
         """The same equations with orders and pivots decided near a state x (n_x,) at t [s], with these parameters.
@@ -147,26 +150,46 @@ class PlantEquations:
 
         return values
 
+    @property
+    def rests(self):
+        """Whether the order of a material constraint rests on slopes that may be active elsewhere."""
+        return any(row.rests for row in (*self._original, *self._material[0]))
+
     @cached_property
-    def orders(self):
-        """What the orders of the material constraints rest on."""
-        rows, points = self._material
-        return Orders(tuple(rows), tuple(rows), 2, points)
+    def written(self):
+        """The material constraints as they are written, by name."""
+        return {name: self.q.on_spheres(e) for name, e in self.mechanism.constraints.items()}
+
+    @property
+    def omitted(self):
+        """What their rows leave out, where it may be active elsewhere, by name."""
+        return omitted(self.written, self._original)
+
+    def full(self):
+        """The material constraints as they are written, by `sized`."""
+        highest, jets = ca.vertcat(*self.q.gamma(2)), ca.vertcat(*self.q, self.velocity)
+        parts = (
+            {name: ca.substitute(e, highest, self.acceleration) for name, e in part.items()}
+            for part in (self.written, self.omitted)
+        )
+        return self.function("full", sized(*parts, jets, self._material[1].sizes(1), self.q.nq))
 
     def hold(self, values):
         """Whether orders and pivots may stay as they are with other parameters (n_p,) or (n_p, N)."""
         values = _cases(values)
         if np.array_equal(values, np.broadcast_to(self.values[:, None], values.shape)):
             return True
-        if self.orders and not all(self.orders.hold(self._points(case)) for case in values.T):
+        if self.rests and not all(map(self._still, values.T)):
             return False
         here, usual = (np.abs(self._pivots(v)).min(axis=2, initial=np.inf) for v in (values, self.values[:, None]))
         return bool(strong(here, usual).all())
 
-    def _points(self, values):
-        """Points of the material constraints with other parameters."""
+    def _still(self, values):
+        """Whether the material constraints hold as they are written where their rows do with other parameters."""
         rows, points = self._material
-        return sample(self.q, rows, 2, Context(points.parameters, values, WINDOW, {}), starts=points)
+        points = sample(self.q, rows, 2, Context(points.parameters, values, WINDOW, {}), starts=points)
+        left, sizes = points.evaluate([*self.written.values()])
+        return bool(np.all(np.abs(left) <= ENTRY * sizes))
 
     @cached_property
     def _pivots(self):

@@ -328,7 +328,7 @@ class Plant(Value, Shown):
         ----------
         name : str
             "ode", "ode_power", "jacobian", "directions", "power", "accelerations", "outputs", "multipliers",
-            "constraints" or "constraints_jacobian".
+            "constraints", "constraints_jacobian", "full" or "project".
 
         Returns
         -------
@@ -536,5 +536,7 @@ FUNCTIONS = {  # arguments of `compiled`: the function, its loops, its projectio
     "multipliers": lambda e: (e.reactions(),),
     "unsolved": lambda e: (e.unsolved(),),
     "constraints": lambda e: (e.constraints()[1],),
+    "full": lambda e: (e.full(),),
+    "project": lambda e: (e.project(),),
     "constraints_jacobian": lambda e: (e.constraints_jacobian(),),
 }

@@ -127,9 +127,9 @@ def _combination(q, rows, b, support, numbers, context, starts=None):
     parts, pivots = _combine(q, rows, b, others, top, numbers, context)
     derivation = in_words(rows[b], [rows[a] for a in others], top)
     uses = combined_uses([rows[a] for a in support])
-    vanishing = sum((rows[a].vanishing for a in support), ())
+    rests = any(rows[a].rests for a in support)
     expression = ca.cse(sum(parts))
-    chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), vanishing=vanishing)
+    chi = replace(rows[b], expression=expression, order=top, uses=uses, parts=tuple(parts), rests=rests)
     row, points = settle(q, chi, rows[:b] + rows[b + 1 :], context, starts)
     if row is None:
         raise _no_state(q, rows[:b] + rows[b + 1 :], context)

@@ -137,12 +137,6 @@ def as_instants(t):
     return np.reshape(t, (len(t), -1))
 
 
-def at_nominal_size(jets, sizes, nq):
-    """Jets (nz, N) with velocities and higher levels of at least their usual sizes (nz,); rows need not hold there."""
-    small = (np.abs(jets) < sizes[:, None]) & (np.arange(len(jets)) >= nq)[:, None]
-    return np.where(small, sizes[:, None], jets)
-
-
 @np.errstate(all="ignore")  # trial steps may leave the domain of the rows: what is not finite is no improvement
 def solve(flow, t, z, iterations=GAUSS_NEWTON_STEPS, natural=False):
     """Solve a flow's rows for jets: level by level, then by damped Gauss-Newton steps on all levels.

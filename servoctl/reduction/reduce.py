@@ -2,30 +2,26 @@
 
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain
 
 import casadi as ca
 import numpy as np
 
 from servoctl.checks import by_name, distinct, finite, mapping, named, require_kind
 from servoctl.errors import NotRealisable, ServoError, SpecificationError
-from servoctl.jets.series import Flow
 from servoctl.reduction.appell import Realisation, require_inertia, saddle
 from servoctl.reduction.cascade import Cascade
 from servoctl.reduction.hidden import complete
 from servoctl.reduction.manifold import (
     Context,
     Points,
-    at_nominal_size,
     follows,
     is_ordinary,
     sample,
     sizes_of_references,
 )
-from servoctl.reduction.orders import Orders
-from servoctl.reduction.ranks import Rank, clean, decide, decide_all, eliminate, pivot_order
+from servoctl.reduction.ranks import Rank, clean, decide_all, eliminate, pivot_order
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
-from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, row_levels, settle_rows
+from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, omitted, settle_rows
 from servoctl.reduction.scales import usual
 from servoctl.reduction.triangular import completed
 from servoctl.spec.mechanism import Mechanism, require_known
@@ -39,7 +35,6 @@ NEARBY = 0.01  # s about an instant for which pivots are chosen; at that instant
 NEAR_SPREAD = 1e-3  # relative width of the points about a state for which pivots are chosen
 WINDOW = (0.1, 1.1)  # s, where points are drawn; t = 0 is too often a special instant of formulas of time
 WEAKER = 1e-6  # relative to its size before: a pivot below this with other parameters is chosen again
-HELD = 1e-9  # residual, relative to the size of its terms, at points where a reduction still holds
 
 
 @frozen
@@ -122,11 +117,10 @@ class Reduction(Packed):
         """Names of the mechanism's coordinates that play no part in the program."""
         return self.mechanism.left_out.get("coordinate", ())
 
-    @cached_property
-    def orders(self):
-        """What the orders of the rows rest on."""
-        decided = (*self.original.values(), *self.rows, *self.realisation.settled)
-        return Orders(decided, self.rows, self.top, self.points)
+    @property
+    def rests(self):
+        """Whether the order of a row rests on slopes that may be active elsewhere."""
+        return any(row.rests for row in (*self.original.values(), *self.rows, *self.realisation.settled))
 
     @cached_property
     def leading(self):
@@ -149,21 +143,21 @@ class Reduction(Packed):
         return replace(self, order=order, cascade=self.cascade and self.cascade.with_order(order))
 
     @cached_property
-    def conditions(self):
-        """What must vanish on the manifold: the residuals with their derivatives, and the balance with the reaction."""
-        q, B = self.mechanism.q, self.realisation.B
-        residuals = chain.from_iterable(row_levels(q, self.original.values(), self.top))
-        return [*residuals, *(self.balance - B @ self.multipliers).elements()]
+    def full(self):
+        """What must vanish along a motion, by name: the rows as they are written, and the balance with the reaction."""
+        m, left = self.mechanism, self.balance - self.realisation.B @ self.multipliers
+        rows = {name: m.q.on_spheres(e) for name, e in {**self.program.residuals, **m.constraints}.items()}
+        return rows | {f"balance of {name}": e for name, e in zip(m.q.force_names, left.elements(), strict=True)}
+
+    @property
+    def omitted(self):
+        """What the rows of the designer leave out of the full equations, where it may be active elsewhere, by name."""
+        return omitted(self.full, self.original.values())
 
     @cached_property
     def balance(self):
         """The balance under the desired actuation, (n,) SX."""
         return desired_balance(self.mechanism, self.program)
-
-    @cached_property
-    def flow(self):
-        """The rows along a motion."""
-        return Flow(self.mechanism.q, self.rows, self.top, self.points)
 
     @cached_property
     def multipliers(self):
@@ -243,34 +237,6 @@ def references(mechanism, program, further=()):
     of_program = (*program.with_turns.values(), *(e for e in chosen if isinstance(e, ca.SX)))
     named_rows = (*m.constraints.values(), *m.followers.values(), *m.outputs.values(), *m.reported.values())
     return tuple(orders_in(m.q, [*of_program, *named_rows, m.balance, m.energy, m.E, m.q.V, m.q.h, *further]))
-
-
-def holds(reduction, values):
-    """Whether a reduction is valid at other parameters (n_p,) than those at which its ranks were decided.
-
-    At points that satisfy its rows with these parameters, the original residuals and the balance must hold, too; every
-    slope on whose vanishing an order rests must vanish there, every rank must be the same, and no pivot far weaker.
-    """
-    q, r = reduction.mechanism.q, reduction
-    context = replace(r.context, values=values)
-    if r.cascade is None:
-        points = sample(q, r.rows, r.top, context, starts=r.points, flow=r.flow)
-    else:
-        points = r.cascade.solved(replace(r.points, values=values), r.top)
-    if not len(points.t) or not r.orders.hold(points):
-        return False
-    for matrix in (r.leading, r.realisation.B.T):
-        numbers = clean(*points.matrix(matrix))
-        if decide(numbers[:, :, 0]).rank < len(numbers):
-            return False
-    before, now = (np.abs(p.evaluate([pivot for _, pivot in r.pivots])[0]) for p in (r.points, points))
-    if not strong(now.min(axis=1), before.min(axis=1)).all():
-        return False
-    left, sizes = points.evaluate(r.conditions)
-    usual = replace(points, z=at_nominal_size(points.z, points.sizes(points.level), q.nq))
-    sizes = np.maximum(sizes, usual.evaluate(r.conditions)[1])  # a velocity that the program keeps at zero is rounding
-    largest = sizes.max(axis=1, keepdims=True)  # as is a length that vanishes at one of the points
-    return bool(np.all(np.abs(left) <= HELD * np.maximum(largest, TINY)))
 
 
 def strong(pivots, before):

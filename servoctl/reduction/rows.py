@@ -35,11 +35,10 @@ class Balance:
 class Row:
     """One scalar equation ψ(t, q, γ', ..., γ^(order)) = 0.
 
-    Its order rests on `vanishing`: slopes that vanish at the points of its derivation, but not identically; the jets in
-    which they are slopes, or products of two; and the expression ψ that they are slopes of. `parts` are terms whose sum
-    ψ is, where these may cancel: beside them rounding of folded constants is zero. `slopes` is a leading gradient that
-    differs from ∂ψ/∂γ^(order) by multiples of other rows' only. Jets of quasi-velocities outside `columns` are
-    functions of time.
+    Its order `rests` on slopes that vanish at the points of its derivation if these do not vanish identically: they may
+    be active elsewhere. `parts` are terms whose sum ψ is, where these may cancel: beside them rounding of folded
+    constants is zero. `slopes` is a leading gradient that differs from ∂ψ/∂γ^(order) by multiples of other rows' only.
+    Jets of quasi-velocities outside `columns` are functions of time.
     """
 
     expression: ca.SX
@@ -50,7 +49,7 @@ class Row:
     derivation: str = ""  # the combination that it is, if it is a hidden constraint
     uses: dict = field(default_factory=dict)  # highest derivative of each residual, and of the balance, in ψ
     parts: tuple = field(default=(), repr=False, compare=False)  # SX
-    vanishing: tuple = field(default=(), repr=False)  # (SX, SX, SX) each
+    rests: bool = field(default=False, repr=False)
     slopes: object = field(default=None, repr=False)  # (1, n) SX, or None
     columns: tuple | None = field(default=None, repr=False)  # quasi-velocities whose jets count; None: all
     _gradients: dict = field(default_factory=dict, repr=False, compare=False)
@@ -75,13 +74,6 @@ class Row:
         jets = q.gamma(level)
         return jets if self.columns is None else tuple(jets[i] for i in self.columns)
 
-    def resting_on(self, slopes, jets):
-        """The row, with slopes in jets among `vanishing` that are zero at points, unless they vanish identically."""
-        pairs = [(e, jet) for e, jet in zip(slopes.elements(), jets.elements(), strict=True) if not e.is_zero()]
-        live = ~identical_zeros([e for e, _ in pairs])
-        some = tuple((e, jet, self.expression) for (e, jet), one in zip(pairs, live, strict=True) if one)
-        return replace(self, vanishing=self.vanishing + some) if some else self
-
     def __repr__(self):
         return f"Row({self.name}: {self.kind}, order {self.order}{', ' + self.derivation if self.derivation else ''})"
 
@@ -93,6 +85,11 @@ def balances(q, expressions):
         Row(e, max(q.order(e), 0), f"balance of {names[i]}", "dynamics", uses={Balance(): 0})
         for i, e in expressions.items()
     ]
+
+
+def omitted(written, rows):
+    """What rows leave out of equations as they are written, where their orders rest on slopes: SX by name."""
+    return {row.name: written[row.name] - row.expression for row in rows if row.rests}
 
 
 def merge_uses(*parts):
@@ -288,7 +285,8 @@ def settle(q, row, others, context, starts=None):
                 return _of_order(q, row, j, points), points
             row = eliminated
         if j > 0:
-            row = _without(q, row.resting_on(row.gradient(q, j).T, q.jet(j)), row.own(q, j), points)
+            row = replace(row, rests=row.rests or _may_live(row.gradient(q, j)))
+            row = _without(q, row, row.own(q, j), points)
     if row.columns is not None:
         return replace(row, order=-1), points
     if q.order(row.expression) == 0 and not np.any(slopes(q, row, 0, points)):
@@ -342,10 +340,15 @@ def _of_order(q, row, j, points):
     if j == 0 or q.order(row.gradient(q)) < j:
         return row
     second = ca.jacobian(row.gradient(q).T, jets)
-    resting = row.resting_on(second, jets @ jets.T)
-    if np.any(clean(*points.evaluate(second.nonzeros()))) or (j > 1 and resting is not row):
+    rests = _may_live(second)
+    if np.any(clean(*points.evaluate(second.nonzeros()))) or (j > 1 and rests):
         return replace(row, affine=False)
-    return resting
+    return replace(row, rests=row.rests or rests)
+
+
+def _may_live(slopes):
+    """Whether slopes that are zero at points may be active elsewhere, as they do not vanish identically."""
+    return not identical_zeros([e for e in slopes.nonzeros() if not e.is_zero()]).all()
 
 
 def _eliminated(q, row, j, values, lower, points, context):

@@ -87,7 +87,7 @@ def close_many(
     seeds = _seeds(run.conditions.sensors, len(columns[next(iter(columns))]))
     threads = executor if executor is None else whole("executor", executor, least=1)
     gathered = None
-    if not run.plant.equations.orders:  # else each loop is judged by itself
+    if not run.plant.equations.rests:  # else each loop is judged by itself
         step = run.law.step.native("step") if run.law.allocation else None
         placed = _numbers_of(run.plant, numbers[0])[: run.plant.at_u]
         gathered = run_batch(derived, loop, (placed, *numbers[1:]), _noise(run, seeds), traced, every, threads, step)

@@ -15,10 +15,10 @@ from servoctl.methods.lanes import OF_A_CASE, fits, integrate, plan_many, plans_
 from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for, stiff
 from servoctl.model.following import breaks_within, moved_by, places_of
+from servoctl.model.full import affirmed
 from servoctl.model.model import Model, including
 from servoctl.model.start import State
 from servoctl.model.starts import linear_starts, same_start
-from servoctl.model.validity import affirmed_each
 from servoctl.progress import progress_bar
 from servoctl.reduction.idle import names_of
 from servoctl.simulation import OFF, as_state, sample_times, simulated
@@ -352,7 +352,7 @@ class _Many:
             return np.ones(self.n, bool)
         for name, column in self.columns.items():
             p[:, names.index(name)] = as_numbers(column)
-        return affirmed_each(self.model, p.T.copy())
+        return affirmed(self.model, p.T.copy())
 
     def _tolerances_fit(self, span, cases, largest, method):
         """Whether motions with magnitudes (n_x, N), `from_start`, need no tolerances of their own, as in `simulate`."""
