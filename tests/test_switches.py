@@ -335,6 +335,60 @@ def test_a_jump_is_found_backwards_and_in_a_rate():
             assert np.all(np.sign(run["x"][:-1]) == np.sign(run["x"][0])) and abs(run["x"][-1]) < 2e-3
 
 
+@pytest.mark.parametrize(
+    ("path", "end", "method"),
+    [
+        (lambda x: 1 / (1 + ca.exp(-20 * (x - 2))), 10.0, None),  # divides by what falls from 1e17 to 1
+        (lambda x: ca.log(1 + ca.exp(-100 * (x - 0.5))) / 100, 1.0, "DOP853"),
+        (lambda x: ca.exp(-1 / (x - 0.5) ** 2), 1.0, "Taylor"),  # all its derivatives vanish at 0.5
+    ],
+    ids=["logistic", "softplus", "flat"],
+)
+def test_functions_that_grow_and_flatten_meet_no_edge(path, end, method):
+    model, start = ideal(lambda t, x, y, dx, dy: y - path(x), x=0.0, dx=1.0)
+    run = sv.simulate(model, start, (0.0, end), method, t_eval=np.linspace(0.0, end, 98))
+    assert run.success and np.abs(run.residual["p"][0]).max() < 1e-7
+
+
+@pytest.mark.filterwarnings("ignore:.*drifted")
+@pytest.mark.parametrize("method", ["RK45", "DOP853"])
+def test_loose_tolerances_make_no_jump_of_an_edge_with_a_limit(method):
+    model, start = ideal(lambda t, x, y, dx, dy: x**2 + y**2 * ca.sin(y) / y - 1, x=0.8, dx=-1.8)
+    assert sv.simulate(model, start, (0.0, 30.0), sv.methods.Adaptive(method, rtol=1e-4)).success
+
+
+JUMPS = {  # path, where it jumps, span, method, drift
+    "far from the origin": (lambda x: 1000 + 0.5 * ca.atan(1 / (x - 0.5)), 0.5, 1.0, None, None),
+    "beside what is large": (lambda x: 10 * ca.sin(x) + 0.002 * ca.atan(1 / (x - 0.5)), 0.5, 1.0, "DOP853", None),
+    "in a long motion": (lambda x: 0.1 * ca.atan(1 / (x - 500.3)), 500.3, 1000.0, "DOP853", "project"),
+    "at a pole": (lambda x: 0.1 * ca.atan(ca.tan(x)), np.pi / 2, 2.5, "RadauIIA", "project"),
+    "right before the end": (lambda x: 0.1 * ca.atan(1 / (x - 0.5)), 0.5, 0.5005239, "DOP853", "project"),
+}
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_jumps_are_found_wherever_they_are(name):
+    path, at, end, method, drift = JUMPS[name]
+    model, start = ideal(lambda t, x, y, dx, dy: y - path(x), x=0.0, dx=1.0)
+    with refused(sv.errors.IntegrationStopped, residual="p") as caught:
+        sv.simulate(model, start, (0.0, end), method, drift=drift)
+    run = caught.value.run
+    assert np.all(run["x"] < at + 1e-6) and np.abs(run.residual["p"][0]).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853"])
+def test_a_jump_right_before_a_switch_is_found(method):
+    q = sv.coordinates("x y z")
+    (x, y, z), (ddx, ddy, ddz) = q, q.d(2)
+    rows = {"p": y - 0.1 * ca.atan(1 / (q.t - 0.48)), "s": ddz - ca.sign(x - 0.5)}
+    mechanism = sv.Mechanism(q, gibbs=(ddx**2 + ddy**2 + ddz**2) / 2)
+    model = sv.derive(mechanism, sv.Program(rows, by="ideal"), keep=["x", "z"])
+    with refused(sv.errors.IntegrationStopped, residual="p") as caught:
+        sv.simulate(model, model.start(x=0.0, dx=1.0, z=0.0, dz=0.0), (0.0, 1.0), method)
+    assert caught.value.details["t"] == pytest.approx(0.48, abs=1e-6)
+    assert np.abs(caught.value.run.residual["p"][0]).max() < 1e-6
+
+
 def test_a_motion_looks_at_residuals_at_edges_alone(monkeypatch):
     from servoctl.methods import edges
 

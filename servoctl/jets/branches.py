@@ -211,6 +211,8 @@ def domain_edges(expressions):
         result.extend((f"{words} {edge:g}, where its domain ends", arguments[0], edge) for edge in edges)
         if op in (ca.OP_DIV, ca.OP_INV):
             result.append((f"it divides by {_words(arguments[-1])}, which reaches zero", arguments[-1], 0.0))
+        if op == ca.OP_TAN:
+            result.append((f"the argument of tan, {_words(arguments[0])}, passes a pole", ca.cos(arguments[0]), 0.0))
         if op == ca.OP_ATAN2:
             angle = f"the angle atan2({', '.join(map(_words, arguments))}) passes pi"
             result.append((angle, ca.fmax(ca.fabs(arguments[0]), arguments[1]), 0.0))

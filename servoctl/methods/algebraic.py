@@ -107,7 +107,7 @@ class _Algebraic(Stepping):
         if self.family is not None:
             branches = self.family.branches(t, x)
             self._use(self.family.at(branches))
-            self.switches = Switches(self.family, branches, self.length, 1, Tolerance(self.model, *DEFAULT))
+            self.switches = Switches(self.family, branches, self.length, 1, Tolerance(self.model, x, *DEFAULT))
 
     def _advance(self, cuts, x):
         """Follow the solution as far as the pivots allow; the instant and the state from which it goes on."""

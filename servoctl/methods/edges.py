@@ -15,9 +15,13 @@ from servoctl.model.equations import invariant_names
 from servoctl.values import frozen
 
 PARTS = 4  # of a step, at least, at whose ends arguments are evaluated
-CLOSE = 0.05  # of its largest distance from an edge so far: an argument that turns within it may have met the edge
-OF_TERMS = 1e-3  # of the terms of a residual: one that changes by more at an edge jumps
-DISTANCES = 0.5 ** np.arange(20, 1, -1)  # of the span: distances from an edge at which residuals are compared
+TOUCHES = 0.8  # of an argument's distances from an edge beside the least one: a vertex below this may touch the edge
+CLOSE = 1e-3  # of its largest distance so far: an argument that turns within this may have met the edge but for errors
+JUMPS = 30.0  # times its tolerance, by which a residual changes at an edge only if it jumps
+COARSE = 1e3  # times as much where steps have no tolerances
+ROUNDING = 1e-13  # of the terms of a residual, multiplied out: its rounding
+DISTANCES = 0.5 ** np.arange(20, 3, -1)  # of the span: distances from an edge at which residuals are compared
+SEEN = 1e-2  # of the span: so far beyond an edge residuals are looked at
 BECAUSE_OF = 1e-6  # of the span: a motion that stops so near an edge stops because of it
 EXPLAINS = 1e-3  # distance of an argument from its edge that explains why a motion cannot go on
 
@@ -36,7 +40,8 @@ def arguments_of(model):
 
     def build():
         rows = [row for row in model.reduction.original.values() if row.order < model.reduction.top]
-        places = [(row.name, *place) for row in rows for place in domain_edges([row.expression])]
+        found = [(row.name, *place) for row in rows for place in domain_edges([row.expression])]
+        places = [*{(argument.element_hash(), edge): (*_, argument, edge) for *_, argument, edge in found}.values()]
         if not places:
             return Arguments()
         names, words, arguments, edges = zip(*places, strict=True)
@@ -57,15 +62,24 @@ def edge(model, t, x):
     return (arguments.words[i], arguments.rows[i]) if distances[i] < EXPLAINS else ("", "")
 
 
-class Edges:
-    """The edges that a motion meets; `tolerance` is that of its states, `span` its length [s]."""
+@frozen
+class _Side:
+    """Residuals at an instant beside an edge, and by how much they may differ from those on the other side, (m,)."""
 
-    def __init__(self, tolerance, span):
-        self.tolerance, self.span = tolerance, span
-        self.met = []  # beyond which residuals are still to be seen: (t, the argument's index, `_beside` before)
-        self.seen = (
-            None  # the last instant and the arguments there, their largest sizes, and where each last met its edge
-        )
+    residuals: np.ndarray
+    allowed: np.ndarray
+
+
+class Edges:
+    """The edges that a motion meets; `tolerance` is that of its states, `span` its length [s].
+
+    Steps of fixed length are `coarse`.
+    """
+
+    def __init__(self, tolerance, span, coarse=False):
+        self.tolerance, self.span, self.jumps = tolerance, span, JUMPS * (COARSE if coarse else 1.0)
+        self.met = []  # beyond which residuals are still to be seen: (t, index of the argument, `_Side` before)
+        self.seen = None  # the last instant and the arguments there, their largest sizes, and where they met an edge
 
     def first(self, model, t, states):
         """The first edge along steps of a model with ends t (S + 1,) at which a residual jumps, as an `End`, or None.
@@ -81,17 +95,17 @@ class Edges:
             return dense(steps_of(t, times), times)
 
         new = self._new(lambda times: arguments.f.grid(times, state(times), model.p), t)
-        open_ = self.met + [(at, i, np.nan_to_num(self._beside(model, state, t, at, -forward))) for at, i in new]
+        open_ = self.met + [(at, i, self._beside(model, state, t, at, -forward)) for at, i in new]
         self.met = []
         for at, i, before in open_:
             after = self._beside(model, state, t, at, forward)
-            change = np.abs(after[0] - before[0])
-            if (change > OF_TERMS * np.fmax(after[1], before[1])).any():
-                known = max(forward * at, forward * t[0]) * forward
-                error = _jump(model, at, arguments.words[i], change)
-                return End(int(steps_of(t, known)), known, state(np.array([known]))[:, 0], error=error)
-            if abs(t[-1] - at) < DISTANCES[-1] * self.span:
-                before[0, after[2] == 1] = np.nan
+            known = before.allowed <= 2 * after.allowed  # else it is zero as far as tolerances tell
+            change = np.abs(after.residuals - np.where(known, before.residuals, 0.0))
+            if (change > after.allowed).any():
+                place = max(forward * at, forward * t[0]) * forward
+                error = _jump(model, at, arguments.words[i], np.where(change > after.allowed, change, 0.0))
+                return End(int(steps_of(t, place)), place, state(np.array([place]))[:, 0], error=error)
+            if abs(t[-1] - at) < SEEN * self.span:
                 self.met.append((at, i, before))
         return None
 
@@ -115,8 +129,7 @@ class Edges:
         size = np.abs(z)
         largest = np.fmax(largest, np.nanmax(size, axis=1, initial=0.0))
         self.seen, result = (at[-2:-1], z[:, -2:-1], largest, last), []
-        crossed = z[:, :-1] * z[:, 1:] < 0
-        turned = (size[:, 1:-1] <= np.fmin(size[:, :-2], size[:, 2:])) & (size[:, 1:-1] < CLOSE * largest[:, None])
+        crossed, turned = z[:, :-1] * z[:, 1:] < 0, _turned(at, size, largest)
         for wide, places in ((1, crossed), (2, turned)):
             for i, k in np.argwhere(places):
                 a, b = max(forward * at[k], forward * t[0]) * forward, at[k + wide]
@@ -126,32 +139,40 @@ class Edges:
         return sorted(result, key=lambda one: forward * one[0])
 
     def _beside(self, model, state, t, at, side):
-        """Residuals on a side of an edge, along steps with ends t, their terms, and whether tolerances resolve them.
+        """Residuals on a side of an edge along steps with ends t.
 
-        They are those of the nearest instant at which tolerances resolve them, or of one farther than a thousandth of
-        the span: infinite where they have no value, and NaN where no instant is so far.
+        They are those of the nearest instant at which tolerances allow hardly more than anywhere on this side: next to
+        an edge slopes may grow without bound. What has no value beyond a thousandth of the span is infinite.
         """
+        end, m = t[-1 if side * (t[-1] - t[0]) > 0 else 0], len(invariant_names(model))
         times = at + side * self.span * DISTANCES
-        times, m = times[(times - t[0]) * (times - t[-1]) <= 0], len(invariant_names(model))
-        result = np.full((3, m), np.nan)
-        if not len(times):
-            return result
+        times = np.append(times[(times - t[0]) * (times - t[-1]) < 0], end)
+        if not side * (end - at) > 0:
+            return _Side(np.zeros(m), np.full(m, np.inf))
         x = state(times)
-        values, allowed = residuals(model, self.tolerance, times, x)
-        terms = terms_of(model).grid(times, x, model.p)[:, ::-1]
-        terms = np.fmax.accumulate(terms, axis=1)[:, ::-1]  # of an instant and all that are farther
-        far, resolved = np.abs(times - at) > self.span / RESOLUTION, allowed <= OF_TERMS * terms
-        values[np.isnan(values) & far] = np.inf
-        known = (resolved | far) & ~np.isnan(values)
-        rows = np.flatnonzero(known.any(axis=1))
-        nearest = known[rows].argmax(axis=1)
-        result[:, rows] = values[rows, nearest], np.nan_to_num(terms[rows, nearest]), resolved[rows, nearest]
-        return result
+        values, tolerance = residuals(model, self.tolerance, times, x)
+        allowed = self.jumps * tolerance + ROUNDING * terms_of(model).grid(times, x, model.p)
+        allowed = np.where(np.isfinite(values + allowed), allowed, np.inf)
+        nearest = np.arange(m), (allowed <= 2 * allowed.min(axis=1, keepdims=True)).argmax(axis=1)
+        values, allowed = values[nearest], allowed[nearest]
+        lost = np.isnan(values) & (abs(end - at) > self.span / RESOLUTION)
+        return _Side(np.where(lost, np.inf, np.nan_to_num(values)), np.where(lost, 0.0, allowed))
+
+
+def _turned(t, size, largest):
+    """Where sizes (m, N) at times t (N,) have a least one that may be zero between its neighbours, (m, N - 2)."""
+    before, here, after = size[:, :-2], size[:, 1:-1], size[:, 2:]
+    with np.errstate(all="ignore"):
+        left, right = (here - before) / (t[1:-1] - t[:-2]), (after - here) / (t[2:] - t[1:-1])
+        bend = (right - left) / (t[2:] - t[:-2])
+        vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
+    low = (vertex < TOUCHES * np.minimum(before, after)) | (here < CLOSE * largest[:, None])
+    return (here <= before) & (here < after) & low
 
 
 def _jump(model, at, why, change):
     """The error of the residual that changes most, by change (m,), at an edge."""
-    worst = int(np.nanargmax(change))
+    worst = int(np.argmax(change))
     name, height = invariant_names(model)[worst][1], float(change[worst])
     row = next((row.name for row in model.reduction.rows if name.endswith(f"({row.name})")), None)
     what = f"The residual {name!r}" if row is None else f"The rate {name} of the residual {row!r}"

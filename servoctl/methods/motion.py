@@ -306,8 +306,8 @@ class Stepping:
 
     def _look_out(self, t, x):
         """Look for the ends of smooth pieces, from the start on."""
-        self.tolerance = Tolerance(self.model, *(self.tolerances or DEFAULT))
-        self.edges = Edges(self.tolerance, self.length)
+        self.tolerance = Tolerance(self.model, x, *(self.tolerances or DEFAULT))
+        self.edges = Edges(self.tolerance, self.length, self.tolerances is None)
         if self.family is not None:
             branches = self.family.branches(t, x)
             self.switches = Switches(self.family, branches, self.length, self.parts, self.tolerance)
@@ -350,17 +350,17 @@ class Stepping:
 
     def _smooth(self, stretch):
         """The outcome of steps: that of the monitor, or the `End` of the smooth piece if it comes first."""
-        switch = None
+        whole, switch = stretch, None
         if self.switches is not None:
             switch = self.switches.first(stretch, self._states_within(stretch), self._state_within(stretch))
         if switch is not None:
             stretch = stretch.first(switch.steps)
         outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
-        stretch = stretch.first(outcome.steps)
-        jump = self.edges.first(self.model, stretch.t, lambda: self._continuous(stretch))
-        if jump is not None:
-            return jump
-        return switch if switch is not None and isinstance(outcome, Fine) else outcome
+        outcome = switch if switch is not None and isinstance(outcome, Fine) else outcome
+        t = whole.t[: outcome.steps + 1]
+        if not isinstance(outcome, Fine) and (outcome.t - t[-1]) * (self.span[1] - self.span[0]) > 0:
+            t = np.append(t, outcome.t)
+        return self.edges.first(self.model, t, lambda: self._continuous(whole)) or outcome
 
     def _states_within(self, stretch):
         """X (n_x, N) from steps (N,) and times (N,), where switches are looked for."""

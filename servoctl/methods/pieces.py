@@ -8,7 +8,7 @@ from servoctl.jets.branches import size_of_terms
 from servoctl.methods.sizes import state_levels
 from servoctl.values import frozen
 
-LEAVES = 1e3  # times what the tolerances of the state allow in a residual: beyond, it differs from zero
+LEAVES = 1e3  # times its tolerance: a residual beyond it differs from zero
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length
 LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
 RESOLUTION = 1000  # instants of a span, at least, at which functions of the motion are inspected within steps
@@ -43,13 +43,13 @@ def net(t, distance, least):
 
 
 class Tolerance:
-    """The tolerances of the state along a motion, and of functions of it; atol is a number or an array (n_x,)."""
+    """The tolerances of the state along a motion from x0 (n_x,), and of functions of it; atol is a number or (n_x,)."""
 
-    def __init__(self, model, rtol, atol):
+    def __init__(self, model, x0, rtol, atol):
         self.rtol, atol = max(rtol, LEAST_RTOL), np.maximum(atol, LEAST_ATOL)
         self.levels = state_levels(model)
         self.atol = np.broadcast_to(atol, len(self.levels))[:, None]
-        self.sizes, self.x0 = np.zeros(len(self.levels)), None
+        self.sizes, self.x0 = np.zeros(len(self.levels)), np.where(self.levels == 0, x0, 0.0)[:, None]
 
     def of(self, slopes, x):
         """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
@@ -60,8 +60,7 @@ class Tolerance:
         self.sizes = self._sizes(x)[:, -1]
 
     def _sizes(self, x):
-        """The largest size of each entry's level so far, (n_x, N): of q its way from the first state, or rounding."""
-        self.x0 = np.where(self.levels == 0, x[:, 0], 0.0)[:, None] if self.x0 is None else self.x0
+        """The largest size of each entry's level so far, (n_x, N): of q its way from x0, or rounding."""
         sizes = np.fmax(np.abs(x - self.x0), LEAST_RTOL / self.rtol * np.abs(x))
         sizes = np.fmin(np.fmax(sizes, self.sizes[:, None]), np.finfo(float).max)
         first = np.searchsorted(self.levels, range(self.levels[-1] + 1))
@@ -69,14 +68,14 @@ class Tolerance:
 
 
 def residuals(model, tolerance, t, x):
-    """Residuals of all levels of the state at times t (N,) and states x (n_x, N), and `LEAVES` times their tolerances.
+    """Residuals of all levels of the state at times t (N,) and states x (n_x, N), and their tolerances, (m, N) each.
 
-    A residual has the tolerance |∂ψ/∂X| (atol + rtol |X|). Both are (m, N) arrays.
+    The tolerance of a residual is |∂ψ/∂X| (atol + rtol |X|).
     """
     y = model.function("invariants").grid(t, x, model.p)
     m = len(y) // (1 + len(x))
     slopes = y[m:].reshape(len(x), m, len(t)).swapaxes(0, 1)
-    return y[:m], LEAVES * tolerance.of(slopes, x)
+    return y[:m], tolerance.of(slopes, x)
 
 
 def terms_of(model):

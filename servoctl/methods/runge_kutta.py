@@ -8,7 +8,7 @@ from servoctl.dense import Hermite
 from servoctl.methods.choice import Poles, Project
 from servoctl.methods.monitor import Fine, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
-from servoctl.methods.pieces import End, residuals, terms_of
+from servoctl.methods.pieces import LEAVES, End, residuals, terms_of
 
 MUCH = 1e-2  # of its terms, by which a residual may change over a step, unless shorter ones change it less
 FINER, CLOSER = 16, 4  # shorter steps in place of one; how often, to come close to where a motion ends
@@ -86,7 +86,7 @@ class RungeKuttaSteps(Stepping):
     def _lost(self, t, states):
         """The first step that leads off the program, also in parts, as its rank is lost there: (k, t, X); or None."""
         values, allowed = residuals(self.model, self.tolerance, t[-1:], states[:, -1:])
-        if (np.abs(values) <= allowed).all():
+        if (np.abs(values) <= LEAVES * allowed).all():
             return None
         for k in np.flatnonzero(self._off(t, states)):
             at, x = self._last(t[k], states[:, k], t[k + 1] - t[k])
@@ -98,7 +98,7 @@ class RungeKuttaSteps(Stepping):
         """Over which steps a residual changes by much of its terms, (S,)."""
         values, allowed = residuals(self.model, self.tolerance, t, states)
         change, terms = np.abs(np.diff(values)), terms_of(self.model).grid(t, states, self.model.p)
-        return ((change > MUCH * terms[:, 1:]) & (change > allowed[:, 1:])).any(axis=0)
+        return ((change > MUCH * terms[:, 1:]) & (change > LEAVES * allowed[:, 1:])).any(axis=0)
 
     def _last(self, t, x, h):
         """The last instant and state before a step of length h [s] leads off the program, by ever shorter ones."""

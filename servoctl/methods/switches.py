@@ -3,7 +3,7 @@
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.methods.pieces import RESOLUTION, End, net, residuals
+from servoctl.methods.pieces import LEAVES, RESOLUTION, End, net, residuals
 from servoctl.model.equations import invariant_names
 
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
@@ -144,7 +144,7 @@ class Switches:
         place = self.tolerance, np.array([end.t]), end.x[:, None]
         (before, allowed), (after, beyond) = (residuals(side, *place) for side in (model, other))
         heights = np.abs(after - before)[:, 0]
-        jumps = np.flatnonzero(heights > np.maximum(allowed, beyond)[:, 0])
+        jumps = np.flatnonzero(heights > LEAVES * np.maximum(allowed, beyond)[:, 0])
         if not len(jumps):
             return None
         name, height = names[jumps[0]], float(heights[jumps[0]])
