@@ -240,3 +240,15 @@ def test_coordinates_with_constant_directions_are_the_dependent_ones_in_all_unit
     assert model.reduction.realisation.dependent == (0, 1, 2)
     run = sv.simulate(model, model.start(0.0, **values(scene.start, names, {}, scales)), scene.t_span)
     assert run.method == "Taylor" and run.message == "finished"
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_verdict_on_a_start_in_motion_is_the_same_in_all_units(unit):
+    """In km other entries of a disc's state were free, and the verdict was that of an upright disc at rest."""
+    scene, verdicts = gallery["rolling-disc"], []
+    for scales in ({}, dict.fromkeys("xyz", unit)):
+        *built, names = moved(*scene.build(), scales=scales)
+        start, guess = (values(known, names, {}, scales) for known in (scene.start, scene.guess))
+        model = sv.derive(*built, {**start, **guess})
+        verdicts.append(sv.report(model, model.start(0.0, guess, **start)).verdict)
+    assert verdicts == ["inconclusive", "inconclusive"]
