@@ -23,10 +23,9 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.methods.accuracy import component_sizes
+from servoctl.methods.accuracy import component_sizes, sizes_of, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
-from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.model.equations import invariant_names
 from servoctl.model.following import corners_of
 from servoctl.model.jets import with_highest
@@ -254,8 +253,12 @@ class FreeEntries:
         self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *corners_of(model))
         self.times = np.linspace(min(ends), max(ends), len(ends) + 9)  # at which is asked what rates depend on
         inertia = model.function("matrices")(t, guess, model.p)[-model.n :]
-        sizes = sizes_of(model, inertia, np.ones(self.n_x), np.inf)  # with which no unit matters
-        self._choose(np.array([t]), np.asarray(guess, dtype=float)[:, None], self.n_x - self.m, sizes)
+        self._choose(
+            np.array([t]),
+            np.asarray(guess, dtype=float)[:, None],
+            self.n_x - self.m,
+            sizes_of(model, inertia, np.ones(self.n_x), np.inf),  # with which no unit matters
+        )
 
     # the internal dynamics
 
