@@ -212,3 +212,43 @@ def test_the_orders_of_a_satellite_do_not_hang_on_where_the_earth_lies(shift):
     model = sv.derive(mechanism, program, {**known, "d2x": -8.13})
     assert [row.order for row in model.reduction.rows] == [3, 2]
     assert model.start(guess={"d2x": -8.13}, **known).free == ("d2x",)
+
+
+@pytest.mark.parametrize("method, tolerance", [("Taylor", 1e-9), ("DOP853", 1e-8), ("RadauIIA", 1e-9)])
+def test_tolerances_do_not_hang_on_where_a_machine_lies(method, tolerance):
+    """At 100 km from the origin they were those of a motion as large: 3.8e-6 of a hopper's size by DOP853."""
+    scene, runs, shifts = gallery["hopper"], [], {"x": 1e5, "y": 1e5}
+    for some in ({}, shifts):
+        *built, names = moved(*scene.build(), some)
+        start, guess = (values(known, names, some, {}) for known in (scene.start, scene.guess))
+        model = sv.derive(*built, {**start, **guess})
+        runs.append(sv.simulate(model, model.start(0.0, guess, **start), scene.t_span, method))
+    assert abs(runs[1].counters["steps"] - runs[0].counters["steps"]) <= 1
+    for name, there in names.items():
+        size = np.abs(runs[0][there]).max()
+        assert runs[1][there] + shifts.get(name, 0.0) == pytest.approx(runs[0][there], abs=tolerance * size), name
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_coordinates_with_constant_directions_are_the_dependent_ones_in_all_units(unit):
+    """In mm angles were, and equations divided by the cosine of one: the motion went on by DOP853."""
+    scene = gallery["appell-hamel"]
+    mechanism, program = scene.build()
+    scales = dict.fromkeys("xyz", unit)
+    machine, residuals, names = moved(mechanism, program, scales=scales)
+    model = sv.derive(machine, residuals, values(scene.start, names, {}, scales))
+    assert model.reduction.realisation.dependent == (0, 1, 2)
+    run = sv.simulate(model, model.start(0.0, **values(scene.start, names, {}, scales)), scene.t_span)
+    assert run.method == "Taylor" and run.message == "finished"
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_verdict_on_a_start_in_motion_is_the_same_in_all_units(unit):
+    """In km other entries of a disc's state were free, and the verdict was that of an upright disc at rest."""
+    scene, verdicts = gallery["rolling-disc"], []
+    for scales in ({}, dict.fromkeys("xyz", unit)):
+        *built, names = moved(*scene.build(), scales=scales)
+        start, guess = (values(known, names, {}, scales) for known in (scene.start, scene.guess))
+        model = sv.derive(*built, {**start, **guess})
+        verdicts.append(sv.report(model, model.start(0.0, guess, **start)).verdict)
+    assert verdicts == ["inconclusive", "inconclusive"]

@@ -14,7 +14,7 @@ import numpy as np
 from servoctl.checks import within
 from servoctl.errors import IntegrationStopped, LimitExceeded, SpecificationError
 from servoctl.methods.choice import Adaptive, Algebraic, Automatic, Project, Taylor
-from servoctl.methods.sizes import motion_sizes, state_levels
+from servoctl.methods.sizes import sizes_of, state_levels
 from servoctl.methods.taylor import order_for
 
 SMALLEST_SIZE = 1e-3  # of a component relative to the largest of its level; a zero component has only rounding
@@ -23,7 +23,7 @@ ATOL = 1e-11  # default absolute tolerance, for motions whose sizes are neither 
 NO_MOTION = 1e-10  # of the size that the inertia gives an entry: less is rounding
 UNLIKE = 3e-3  # of the largest of its level: a smaller entry has a tolerance of its own
 COARSE = 10.0  # times rtol: an absolute tolerance above this part of a size decides about its error
-LARGE = 1e3  # size above which the default absolute tolerance comes near rounding and grows with the size
+LARGE = 1e3  # speed above which the default absolute tolerance comes near rounding and grows with the speed
 FINEST = 1e-15  # tolerance below which steps shorten and rounding grows
 SAME = 1.0 + 1e-9  # tolerances within this factor are one and the same, up to the rounding of their decades
 COARSEST_ACCURACY, FINEST_ACCURACY = 1e-1, 1e-13  # accuracies that make sense in double precision
@@ -53,11 +53,12 @@ def component_sizes(values, levels, least=SMALLEST_SIZE):
 
 
 def large_tolerances(model, t, x):
-    """Absolute tolerances (n_x,) for a motion that starts so large that the default is rounding of it; else None.
+    """Absolute tolerances (n_x,) for a motion that starts so fast that the default is rounding of it; else None.
 
-    Its span is t = (t0, t1) [s], and x (n_x,) the state at its start.
+    Its span is t = (t0, t1) [s], and x (n_x,) the state at its start. Where that lies has no part in it.
     """
-    sizes = motion_sizes(model, np.asarray(t, dtype=float), np.column_stack([x, x]))
+    inertia = model.function("matrices")(t[0], x, model.p)[-model.n :]
+    sizes = sizes_of(model, inertia, np.where(state_levels(model) == 0, 0.0, np.abs(x)), t[1] - t[0])
     return ATOL * np.where(sizes > LARGE, sizes, 1.0) if sizes.max() > LARGE else None
 
 

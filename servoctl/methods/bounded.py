@@ -23,7 +23,7 @@ from servoctl.errors import (
     SpecificationError,
     UnstableInternalDynamics,
 )
-from servoctl.methods.accuracy import component_sizes, state_levels
+from servoctl.methods.accuracy import component_sizes, sizes_of, state_levels
 from servoctl.methods.motion import DEFAULT_SAMPLES, Motion, breakpoints, margin_at
 from servoctl.methods.radau import basis, radau
 from servoctl.model.equations import invariant_names
@@ -252,7 +252,13 @@ class FreeEntries:
         self.n_x, self.m = len(model.state_names), len(invariant_names(model))
         self.size, ends = np.maximum(np.abs(guess), 1.0), (t, *corners_of(model))
         self.times = np.linspace(min(ends), max(ends), len(ends) + 9)  # at which is asked what rates depend on
-        self._choose(np.array([t]), np.asarray(guess, dtype=float)[:, None], self.n_x - self.m)
+        inertia = model.function("matrices")(t, guess, model.p)[-model.n :]
+        self._choose(
+            np.array([t]),
+            np.asarray(guess, dtype=float)[:, None],
+            self.n_x - self.m,
+            sizes_of(model, inertia, np.ones(self.n_x), np.inf),  # with which no unit matters
+        )
 
     # the internal dynamics
 
@@ -277,14 +283,14 @@ class FreeEntries:
         f, J, g, G = np.split(y, np.cumsum([n, n * n, m]), axis=1)
         return f, J.reshape(len(t), n, n).swapaxes(1, 2), g, G.reshape(len(t), n, m).swapaxes(1, 2)
 
-    def _choose(self, t, x, count):
-        """Choose the free entries: those that span the tangent space at all these states best."""
+    def _choose(self, t, x, count, sizes):
+        """Choose the free entries: those that span the tangent space at all these states best, in sizes (n_x,)."""
         from scipy.linalg import qr
 
         G = self._evaluated(t, x)[3]
         if not np.isfinite(G).all():
             raise self._failure("The invariants are not finite near the guess.", t[0])
-        tangents = np.linalg.svd(G * self.size)[2][:, self.m :]
+        tangents = np.linalg.svd(G * sizes)[2][:, self.m :]
         self.free = np.sort(qr(np.concatenate(tangents), pivoting=True)[2][:count])
         self.solved = np.setdiff1d(np.arange(self.n_x), self.free)
         least = np.linalg.svd(tangents[:, :, self.free], compute_uv=False)[:, -1] if count else np.ones(1)
@@ -384,7 +390,7 @@ class Problem(FreeEntries):
         along = first.x[:, None] + np.linspace(0, 1, 41) * (last.x - first.x)[:, None]
         along = self._quasi_static(times, along, None if first.modes is first else first.others)
         self.size = component_sizes(along, state_levels(model), 1.0)
-        self._choose(times, along, self.n_x - self.m)
+        self._choose(times, along, self.n_x - self.m, self.size)
         self.first, self.last = (self.equilibrium(end.t, end.x, end.moving) for end in (first, last))
         self._require_splitting()
 

@@ -16,7 +16,7 @@ import numpy as np
 from servoctl.errors import NotRealisable, SingularProgram, SpecificationError
 from servoctl.reduction.appell import Realisation, plant_solution
 from servoctl.reduction.hidden import complete
-from servoctl.reduction.ranks import clean, decide_all, decide_each, sizeable_columns
+from servoctl.reduction.ranks import clean, decide, decide_all, decide_each, sizeable_columns
 from servoctl.reduction.rows import balances, settle_rows
 from servoctl.spec.coordinates import require_order
 from servoctl.spec.mechanism import inverse_directions
@@ -79,7 +79,11 @@ def _realised(mechanism, constraints, directions, actuation, points, among=None,
         )
     cleaned = clean(numbers, sizes)
     inertia = clean(*points.matrix(ca.diag(mechanism.mass)))[candidates, 0, best]
-    columns = sizeable_columns(cleaned[:, candidates, best], list(rank.columns), inertia)
+    # columns of numbers alone vanish nowhere, in no unit
+    steady = [i for i, j in enumerate(candidates) if B[j, :].is_constant()]
+    alone = decide(cleaned[:, [candidates[i] for i in steady], best])
+    columns = [steady[i] for i in alone.columns] if alone.rank == rank.rank else list(rank.columns)
+    columns = sizeable_columns(cleaned[:, candidates, best], columns, inertia)
     dependent = tuple(sorted(candidates[i] for i in columns))
     regular = [p for p, rank in enumerate(decide_each(cleaned[:, list(dependent)])) if rank.rank == len(cleaned)]
     independent = tuple(i for i in range(n) if i not in dependent)

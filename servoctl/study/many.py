@@ -359,7 +359,7 @@ class _Many:
         default, levels = method.atol is None, state_levels(self.model)
         fit, doubtful = np.ones(largest.shape[1], bool), unlike(levels, largest)
         if default:
-            fit = np.maximum(largest, np.abs(cases[0].T)).max(axis=0) <= LARGE
+            fit = largest.max(axis=0) <= LARGE
             doubtful |= (largest < ATOL / method.rtol).any(axis=0)
         some = np.flatnonzero(doubtful)
         if len(some):
