@@ -362,7 +362,7 @@ JUMPS = {  # path, where it jumps, span, method, drift
     "beside what is large": (lambda x: 10 * ca.sin(x) + 0.002 * ca.atan(1 / (x - 0.5)), 0.5, 1.0, "DOP853", None),
     "in a long motion": (lambda x: 0.1 * ca.atan(1 / (x - 500.3)), 500.3, 1000.0, "DOP853", "project"),
     "at a pole": (lambda x: 0.1 * ca.atan(ca.tan(x)), np.pi / 2, 2.5, "RadauIIA", "project"),
-    "right before the end": (lambda x: 0.1 * ca.atan(1 / (x - 0.5)), 0.5, 0.5005239, "DOP853", "project"),
+    "right before the end": (lambda x: 0.1 * ca.atan(1 / (x - 0.5)), 0.5, 0.5005554, "DOP853", "project"),
 }
 
 
@@ -394,7 +394,7 @@ def test_a_motion_looks_at_residuals_at_edges_alone(monkeypatch):
 
     looked, known = [], edges.residuals
     monkeypatch.setattr(edges, "residuals", lambda *given: looked.append(given[2]) or known(*given))
-    for residual, met in ((lambda t, x, y, dx, dy: y - ca.sin(x), 0), (lambda t, x, y, dx, dy: y - ca.sin(x) / x, 2)):
+    for residual, met in ((lambda t, x, y, dx, dy: y - ca.sin(x), 0), (lambda t, x, y, dx, dy: y - ca.sin(x) / x, 4)):
         model, start = ideal(residual, x=-0.5, dx=1.0)
         for method in ("Taylor", "RadauIIA"):
             looked.clear()

@@ -16,13 +16,13 @@ from servoctl.values import frozen
 
 PARTS = 4  # of a step, at least, at whose ends arguments are evaluated
 TOUCHES = 0.8  # of an argument's distances from an edge beside the least one: a vertex below this may touch the edge
-CLOSE = 1e-3  # of its largest distance so far: an argument that turns within this may have met the edge but for errors
+CLOSE = 1e-8  # of its largest distance so far: an argument that comes so near has met the edge, and may stay there
 JUMPS = 30.0  # times its tolerance, by which a residual changes at an edge only if it jumps
 COARSE = 1e3  # times as much where steps have no tolerances
+OF_TERMS = 1e-3  # of its terms, which a residual does not reach a thousandth of the span away from an edge
 ROUNDING = 1e-13  # of the terms of a residual, multiplied out: its rounding
 DISTANCES = 0.5 ** np.arange(20, 3, -1)  # of the span: distances from an edge at which residuals are compared
 SEEN = 1e-2  # of the span: so far beyond an edge residuals are looked at
-BECAUSE_OF = 1e-6  # of the span: a motion that stops so near an edge stops because of it
 EXPLAINS = 1e-3  # distance of an argument from its edge that explains why a motion cannot go on
 
 
@@ -79,6 +79,7 @@ class Edges:
     def __init__(self, tolerance, span, coarse=False):
         self.tolerance, self.span, self.jumps = tolerance, span, JUMPS * (COARSE if coarse else 1.0)
         self.met = []  # beyond which residuals are still to be seen: (t, index of the argument, `_Side` before)
+        self.start = None  # the first instant and state, where slopes are as usual
         self.seen = None  # the last instant and the arguments there, their largest sizes, and where they met an edge
 
     def first(self, model, t, states):
@@ -94,6 +95,8 @@ class Edges:
         def state(times):
             return dense(steps_of(t, times), times)
 
+        if self.start is None:
+            self.start = t[:1], state(t[:1])
         new = self._new(lambda times: arguments.f.grid(times, state(times), model.p), t)
         open_ = self.met + [(at, i, self._beside(model, state, t, at, -forward)) for at, i in new]
         self.met = []
@@ -113,7 +116,7 @@ class Edges:
         """The error of a motion that cannot go on at t, right beyond an edge; None elsewhere."""
         arguments = arguments_of(model)
         for at, i, _ in self.met:
-            if abs(t - at) < BECAUSE_OF * self.span:
+            if abs(t - at) < self.span / RESOLUTION:
                 row = arguments.rows[i]
                 return _stop(f"The program of {row!r} ends", at, arguments.words[i], row, level=row)
         return None
@@ -142,7 +145,8 @@ class Edges:
         """Residuals on a side of an edge along steps with ends t.
 
         They are those of the nearest instant at which tolerances allow hardly more than anywhere on this side: next to
-        an edge slopes may grow without bound. What has no value beyond a thousandth of the span is infinite.
+        an edge slopes may grow without bound. Beyond a thousandth of the span, where a motion may stay on its edge, the
+        terms bound them, too, and what has no value is infinite.
         """
         end, m = t[-1 if side * (t[-1] - t[0]) > 0 else 0], len(invariant_names(model))
         times = at + side * self.span * DISTANCES
@@ -151,23 +155,26 @@ class Edges:
             return _Side(np.zeros(m), np.full(m, np.inf))
         x = state(times)
         values, tolerance = residuals(model, self.tolerance, times, x)
-        allowed = self.jumps * tolerance + ROUNDING * terms_of(model).grid(times, x, model.p)
+        terms, far = terms_of(model).grid(times, x, model.p), np.abs(times - at) > self.span / RESOLUTION
+        allowed = self.jumps * tolerance + ROUNDING * terms
+        usual = self.jumps * residuals(model, self.tolerance, *self.start)[1]
+        allowed = np.where(far, np.fmin(allowed, np.fmax(usual, OF_TERMS * terms)), allowed)
         allowed = np.where(np.isfinite(values + allowed), allowed, np.inf)
         nearest = np.arange(m), (allowed <= 2 * allowed.min(axis=1, keepdims=True)).argmax(axis=1)
         values, allowed = values[nearest], allowed[nearest]
-        lost = np.isnan(values) & (abs(end - at) > self.span / RESOLUTION)
+        lost = np.isnan(values) & far[-1]
         return _Side(np.where(lost, np.inf, np.nan_to_num(values)), np.where(lost, 0.0, allowed))
 
 
 def _turned(t, size, largest):
-    """Where sizes (m, N) at times t (N,) have a least one that may be zero between its neighbours, (m, N - 2)."""
+    """Where sizes (m, N) at times t (N,) become zero, or have a least one that may be, (m, N - 2)."""
     before, here, after = size[:, :-2], size[:, 1:-1], size[:, 2:]
     with np.errstate(all="ignore"):
         left, right = (here - before) / (t[1:-1] - t[:-2]), (after - here) / (t[2:] - t[1:-1])
         bend = (right - left) / (t[2:] - t[:-2])
         vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
-    low = (vertex < TOUCHES * np.minimum(before, after)) | (here < CLOSE * largest[:, None])
-    return (here <= before) & (here < after) & low
+    arrives = (here < CLOSE * largest[:, None]) & (before >= CLOSE * largest[:, None])
+    return arrives | (here <= before) & (here < after) & (vertex < TOUCHES * np.minimum(before, after))
 
 
 def _jump(model, at, why, change):

@@ -322,7 +322,6 @@ class Stepping:
         """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
         outcome = self._smooth(stretch)
         self.motion.reaches(from_start(self.model, stretch.x[:, : outcome.steps + 1], self.x0))
-        self.tolerance.accept(stretch.x[:, : outcome.steps + 1])
         return outcome if self.events is None else self._event(stretch, outcome) or outcome
 
     def _event(self, stretch, outcome):
@@ -357,6 +356,7 @@ class Stepping:
             stretch = stretch.first(switch.steps)
         outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
         outcome = switch if switch is not None and isinstance(outcome, Fine) else outcome
+        self.tolerance.accept(whole.x[:, : outcome.steps + 1])
         t = whole.t[: outcome.steps + 1]
         if not isinstance(outcome, Fine) and (outcome.t - t[-1]) * (self.span[1] - self.span[0]) > 0:
             t = np.append(t, outcome.t)

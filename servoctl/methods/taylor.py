@@ -388,8 +388,12 @@ class TaylorSteps(Stepping):
             return False
         if (least < DEGRADED * np.maximum(most, pivot_sizes(model))).any():
             return False
-        log, edges = _Log(self.f, self.n_x, p, rows), Edges(Tolerance(model, x0, *self.tolerances), abs(t1 - t0))
-        if edges.first(model, log.t, lambda: lambda k, t: log.jets(k, t, self.top - 1)) is not None:
+        log, tolerance = _Log(self.f, self.n_x, p, rows), Tolerance(model, x0, *self.tolerances)
+        tolerance.accept(log.states)
+        if (
+            Edges(tolerance, abs(t1 - t0)).first(model, log.t, lambda: lambda k, t: log.jets(k, t, self.top - 1))
+            is not None
+        ):
             return False
         self.motion.fill(model, t_eval, jets)
         self.motion.largest, self.motion.drifted = states, float(drifted[0])
