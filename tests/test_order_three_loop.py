@@ -362,6 +362,18 @@ def test_a_lag_measures_what_it_delays(spirals):
     assert loop.residual["kappa"][0, -1] == pytest.approx(-0.02, rel=0.02)
 
 
+def test_a_lag_measures_a_row_of_accelerations():
+    """A row of order 2 behind lags is the model's, too: without a sum of what is measured 10 % of it are lost."""
+    body, _ = particle()
+    plan = planned(body, sv.Program({"a": body.q.d(2)[0] - 1.0, "level": body.q[1]}), (0.0, 1.0), x=0.0, dx=0.0)
+    lag = {"fx": 0.02, "fy": 0.02}
+    law = sv.computed(plan, sv.plant(body, lag=lag), rate=500.0, poles=0.1)
+    assert law.info["orders"] == {"a": 2, "level": 3}
+    begun = np.append(plan.state(0.0), [plan["fx"][0], plan["fy"][0]])
+    loop = sv.close(sv.plant(body, m=1.1, lag=lag), law, begun, plan.span)
+    assert abs(loop.residual["a"][0, -1]) < 3e-4
+
+
 # which F ---------------------------------------------------------------------------------------------------------
 
 

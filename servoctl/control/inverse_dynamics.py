@@ -132,9 +132,9 @@ class _Extension:
     def needed(self):
         """The least numbers of poles by residual: its relative degree, or the k of a row ψ = D^k F, at least one.
 
-        Behind integrators or lags an F with accelerations is known by the model alone; one pole more measures it.
+        Behind integrators or lags a row with accelerations is known by the model alone; one pole more measures it.
         """
-        by_model = {name: k > 0 and self.q.order(self.rows[name]) > 1 for name, k in self.powers.items()}
+        by_model = {name: self.q.order(row) > 1 for name, row in self.rows.items()}
         return {name: max(self.powers[name], r + (r > 0 and by_model[name]), 1) for name, r in self.orders.items()}
 
     def _require_affine(self, name, row):
