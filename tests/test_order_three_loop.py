@@ -208,6 +208,26 @@ def test_noise_in_the_curvature(curved):
     assert loop.residual["kappa"][0].std() == pytest.approx(5.5e-3, rel=0.1)
 
 
+def test_an_angle_is_followed_through_whole_turns():
+    """The error of F = atan2 jumps by no turn where the plan and the machine pass π one after the other."""
+    body, _ = particle()
+    dx, dy = body.q.d(1)
+    rows = {"heading": body.q.dt(ca.atan2(dy, dx), 2) - 0.5, "speed": body.q.dt(ca.sqrt(dx**2 + dy**2), 2) - 0.1}
+    start = {"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2x": 0.0, "d2y": 0.0}
+    plan = planned(body, sv.Program(rows), (0.0, 4.0), **start)
+    law = sv.computed(plan, sv.plant(body), rate=1000.0, poles={"heading": 2 * SLOW, "speed": 2 * SLOW})
+    loop = closed(law)
+    assert loop.residual["heading"][0, -1] == pytest.approx(-0.1 * 0.5 / 25, rel=0.02)
+    assert np.abs(loop.residual["heading"]).max() < 0.05 and np.abs(loop.inputs).max() < 10.0
+    off = np.array([0.0, 0.0, 0.0, 0.05])  # the machine turns ahead
+    integral = sv.lqr(plan, sv.plant(body), rate=1000.0, integral={"heading": 1.0})
+    loop = closed(integral, off=off)
+    assert np.abs(loop.residual["heading"][0]).max() < 0.1
+    assert np.abs(loop.signal["integral of heading"]).max() < 0.1
+    west = planned(body, sv.Program(rows), (0.0, 0.1), **start | {"dx": -1.0})
+    assert np.isfinite(closed(sv.lqr(west, sv.plant(body), rate=1000.0, integral={"heading": 1.0})).inputs).all()
+
+
 # sampled ---------------------------------------------------------------------------------------------------------
 
 

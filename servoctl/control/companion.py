@@ -17,6 +17,7 @@ from servoctl.codegen.function import compiled
 from servoctl.control.residuals import Along, as_read, in_symbols_of, paths_along
 from servoctl.control.sampling import discretised, spectral_radii
 from servoctl.errors import SpecificationError
+from servoctl.jets.branches import without_turns
 from servoctl.methods.stability import FASTEST, HALVINGS
 from servoctl.model.equations import Equations
 from servoctl.model.model import Model
@@ -53,7 +54,8 @@ class Companion:
                 )
         rows = in_symbols_of(plant, model, read)  # in symbols that `beside` shares
         self.q = plant.mechanism.q.beside(**dict.fromkeys(follow))[0] if follow else plant.mechanism.q
-        self.rows = rows | {name: rows[name] - self.q.family.jet(name + SUFFIX, 0) for name in powers}
+        off = {name: rows[name] - self.q.family.jet(name + SUFFIX, 0) for name in powers}
+        self.rows = rows | {name: without_turns(ca.SX(e)) for name, e in off.items()}
         self.paths, self.powers = paths_along(model, plant) | follow, dict.fromkeys(rows, 0) | powers
 
 
