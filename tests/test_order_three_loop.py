@@ -451,5 +451,8 @@ def test_a_decoupling_that_loses_its_rank_is_refused():
     vars(given).update(powers={"a": 1, "b": 0}, names=("a", "b"), along=(times, None), xi=ca.SX(0, 1), turns=False, levels=[], v=ca.SX(0, 1))
     given._at = lambda *_: (lost, np.abs(lost))
     given.controller_states = lambda *_: None
-    with refused(SpecificationError, "sv.lqr", t=0.5, names=("a", "b")):
+    with refused(SpecificationError, "singular at t = 0.5 s", "sv.lqr", t=0.5, names=("a", "b")):
+        given.require_rank()
+    lost[1, 1] += 0.04
+    with refused(SpecificationError, "singular between t = 0.4 s and t = 0.5 s", "sv.lqr", t=pytest.approx(0.4)):
         given.require_rank()

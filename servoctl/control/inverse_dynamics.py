@@ -142,27 +142,36 @@ class _Extension:
         bent = ca.hessian(row, self.v)[0].nonzeros()
         if bent and not vanish(spread(bent)).all():
             raise SpecificationError(
-                f"Accelerations do not enter {name!r} in proportion.",
+                f"{name!r} is not affine in the accelerations.",
                 "What is fed back by accelerations is solved for the inputs, once and for all.",
                 do="Use sv.lqr, which follows plans of any program.",
                 name=name,
             )
 
     def require_rank(self):
-        """Refuse a decoupling that loses its rank somewhere along the plan, for rows that are fed back by F."""
+        """Refuse a decoupling that loses its rank somewhere along the plan, for rows that are fed back by F.
+
+        A square matrix does so between two points, too, where the sign of its determinant changes.
+        """
         if not any(self.powers.values()):
             return
         times, states = self.along
         values = self._at(self.decoupling, times, states, self.controller_states(times, states))[0]
-        sizes = np.linalg.svd(np.moveaxis(_without_units(values).astype(float), 2, 0), compute_uv=False)[:, -1]
-        k = int(np.argmin(sizes))
-        if not sizes[k] > RANK_LOST * sizes.max():
+        matrices = np.moveaxis(_without_units(values).astype(float), 2, 0)
+        sizes = np.linalg.svd(matrices, compute_uv=False)[:, -1]
+        signs = np.sign(np.linalg.det(matrices)) if values.shape[0] == values.shape[1] else np.ones(len(times))
+        lost, turned = ~(sizes > RANK_LOST * sizes.max()), signs[1:] != signs[:-1]
+        if lost.any() or turned.any():
+            where = times[[np.argmin(sizes)]] if lost.any() else times[np.argmax(turned) :][:2]
             raise SpecificationError(
-                f"The inputs do not reach {', '.join(self.names)} one by one at t = {times[k]:.6g} s of the plan.",
+                f"The decoupling matrix of {', '.join(self.names)} is singular "
+                + ("at " if lost.any() else "between ")
+                + " and ".join(f"t = {t:.6g} s" for t in where)
+                + " of the plan.",
                 "The decoupling matrix of what is fed back has full rank along the whole plan.",
                 do="Use sv.lqr, which follows plans of any program, or keep the plan off this place.",
                 names=self.names,
-                t=float(times[k]),
+                t=float(where[0]),
             )
 
     def _rate(self, expression):
