@@ -9,7 +9,7 @@ from test_export_law import InC, close_to
 import servoctl as sv
 from servoctl.control.companion import fastest_poles
 from servoctl.control.inverse_dynamics import _Extension
-from servoctl.errors import NameUnknown, SpecificationError, UnstableInternalDynamics
+from servoctl.errors import NameUnknown, ServoError, SpecificationError, UnstableInternalDynamics
 from servoctl.gallery import gallery, vtol
 from servoctl.interop import nlsys, start
 from servoctl.methods import Adaptive
@@ -351,6 +351,9 @@ def test_in_lanes_and_in_python_control(curved):
     system = nlsys(short)
     found = control.input_output_response(system, short.t, np.zeros((system.ninputs, len(short.t))), start(short))
     assert np.abs(found.outputs[0] - short["x"]).max() < 1e-12
+    at_rest = np.concatenate([np.zeros(4), start(short)[4:]])  # where a curvature has no value
+    with refused(ServoError, "returned NaN", name="computed", t=0.0):
+        control.input_output_response(system, short.t, np.zeros((system.ninputs, len(short.t))), at_rest)
 
 
 def test_internal_dynamics_are_those_of_what_is_fed_back():
