@@ -417,8 +417,9 @@ def computed(
         Samples per second [Hz].
     poles : float or dict of str to sequence of complex, optional
         One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] by residual, as many as its
-        relative degree with the extension, or as k, at least one (`law.info["orders"]`), or one more. As far as they
-        are more than the relative degree, sums of errors are fed back, which stop while an actuator is at its limit.
+        relative degree with the extension, or as k, at least one (`law.info["orders"]`, the least number), or one more.
+        As far as they are more than the relative degree, sums of errors are fed back, which stop while a command exceeds
+        the limits of `plant`. Behind lags and integrators a residual with accelerations takes one pole more for that.
     delay : int
         Delay of the loop in samples, for which the poles are checked.
 
@@ -442,8 +443,8 @@ def computed(
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
     _require_invertible(plan.model.reduction, plant)
-    rows = Companion(plan, plant, np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS))
-    _require_stable(without_errors(plan) if any(rows.powers.values()) else plan)
+    rows = Companion(plan, plant, reference.t)
+    internal = _stable(without_errors(plan) if any(rows.powers.values()) else plan)
     linear = linearise(plan, plant, rows)
     _require_smooth(plan, linear)
     orders, degrees = linear.needed, linear.orders
@@ -460,8 +461,8 @@ def computed(
     columns = ([plant.parameters, [reference.period], u, *coefficients, r, b] for u, r, b in rows)
     info = {"orders": orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {len(values)}" for name, values in poles.items())
-    if free := plant.n_x + linear.xi.numel() - sum(degrees.values()):
-        info["free"] = f"{free} of {plant.n_x + linear.xi.numel()} states are not fed back: they are free to drift"
+    if internal.verdict == "neutral":
+        info["free"] = f"not fed back, free to drift: {', '.join(internal.names)}"
     return Law(
         name="computed",
         measures=plant.state_names,
@@ -506,11 +507,11 @@ def _require_class(plan, name, order, reference):
         )
 
 
-def _require_stable(plan):
-    """Refuse a plan whose internal dynamics are not known to be stable."""
+def _stable(plan):
+    """The internal dynamics of a plan; refuses those that are not known to be stable."""
     internal = internal_dynamics(plan)
     if internal.verdict not in ("unstable", "inconclusive"):
-        return
+        return internal
     worst, names = float(internal.eigenvalues.real.max(initial=-np.inf)), ", ".join(internal.names)
     facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
     raise UnstableInternalDynamics(
@@ -542,7 +543,7 @@ def _poles(poles, orders):
         if values.shape not in ((order,), (order + 1,)) or not np.isfinite(values).all() or not _paired(values):
             raise SpecificationError(
                 f"The poles of {name!r} are {poles.get(name)!r}.",
-                f"Its error dynamics have order {order} and as many poles, or one more; complex ones in pairs.",
+                f"It takes {order} or {order + 1} poles; complex ones in pairs.",
                 do=f"Pass {order}, as {[-4.0] * order}.",
                 name=name,
                 order=order,
