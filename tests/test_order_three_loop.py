@@ -7,7 +7,7 @@ from refusals import refused
 from test_export_law import InC, close_to
 
 import servoctl as sv
-from servoctl.control.companion import fastest_poles
+from servoctl.control.companion import fastest_poles, sampled_radius
 from servoctl.control.inverse_dynamics import _Extension
 from servoctl.errors import NameUnknown, ServoError, SpecificationError, UnstableInternalDynamics
 from servoctl.gallery import gallery, vtol
@@ -265,6 +265,19 @@ def test_bounds_of_sums_and_integrators():
     }  # fmt: skip
     for (delay, r), bounds in table.items():
         assert [fastest_poles(n, r, delay) for n in range(r, r + 4)] == pytest.approx(bounds, rel=2e-4, abs=5e-5)
+
+
+def test_bounds_of_long_delays():
+    """One integrator under feedback that is d samples late: p h = 2 sin(π/(4d + 2))."""
+    for delay in (10, 25, 100, 1000):
+        assert fastest_poles(1, 1, delay) == pytest.approx(2 * np.sin(np.pi / (4 * delay + 2)), rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [2, 4, 6, 8, 12])
+def test_slow_poles_are_stable(n):
+    """The slowest of n equal poles under the hold, 1 + p h s with s near -1; their spread is of the order of (p h)^(1/n)."""
+    for step in (1e-1, 1e-3, 1e-5):
+        assert -1.0 < (sampled_radius(np.full(n, -step), 1.0) - 1) / step < -0.5
 
 
 def test_sums_stop_at_a_limit(spirals, curved):

@@ -418,8 +418,8 @@ def computed(
     poles : float or dict of str to sequence of complex, optional
         One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] by residual, as many as its
         relative degree with the extension, or as k, at least one (`law.info["orders"]`, the least number), or one more.
-        As far as they are more than the relative degree, sums of errors are fed back, which stop while a command exceeds
-        the limits of `plant`. Behind lags and integrators a residual with accelerations takes one pole more for that.
+        Behind lags and integrators a residual with accelerations takes one pole more. As far as they are more than the
+        relative degree, sums of errors are fed back, which stop while a command exceeds the limits of `plant`.
     delay : int
         Delay of the loop in samples, for which the poles are checked.
 
