@@ -124,7 +124,18 @@ class Closed(Sampled, Value):
         return self.p_within(0)
 
     def p_within(self, half):
-        """Those of `p` at the start of each sample, in its middle, or at its end: `half` is 0, 1 or 2."""
+        """Those of `p` at the start of each sample, in its middle, or at its end.
+
+        Parameters
+        ----------
+        half : int
+            0, 1 or 2.
+
+        Returns
+        -------
+        (n_p, N) array
+            As `p`, in the mechanism's units.
+        """
         loop, inputs = self.loop, self.inputs
         step, stage = divmod(half * loop.substeps, 2) if half < 2 else (loop.substeps - 1, 2)
         if loop.transport is not None:
@@ -337,7 +348,7 @@ class Closed(Sampled, Value):
             program = self.plan.model.reduction.program.names if self.plan is not None and self.plan.model else ()
             read = known_residuals(self.plan.model, self.plant).integrated if program else {}
             for what, names in (
-                ("read by what they are derivatives of, minus that along the plan:", [n for n in sizes if n in read]),
+                ("shown as F − F along the plan:", [n for n in sizes if n in read]),
                 ("not evaluated, as the loop has too few samples:", [n for n in program if n not in sizes]),
             ):
                 lines.append(fitted(lambda room: f"{what} {listed(names, room)}", full) * bool(names))  # noqa: B023

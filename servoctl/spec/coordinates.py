@@ -6,7 +6,7 @@ from math import factorial
 
 import casadi as ca
 
-from servoctl.checks import as_list, column, is_whole, mapping, matrix, named, require_kind, whole_of
+from servoctl.checks import as_list, column, is_number, is_whole, mapping, matrix, named, require_kind, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero
@@ -57,10 +57,23 @@ def _linear(name):
     return applied
 
 
-class Rate(ca.SX):
-    """A k-th total derivative that knows its antiderivative `of`, which sums keep."""
+def _scaled(name):
+    """A product or quotient of SX that keeps the antiderivative where the other factor is a number."""
 
+    def applied(self, factor):
+        operation = getattr(ca.SX, name)
+        value = operation(self, factor)
+        return Rate(value, operation(self.of, factor), self.k) if is_number(factor) else value
+
+    return applied
+
+
+class Rate(ca.SX):
+    """A k-th total derivative that knows its antiderivative `of`, which sums and multiples by numbers keep."""
+
+    __array_ufunc__ = None  # numbers of NumPy leave operations to it
     __add__, __radd__, __sub__, __rsub__, __neg__ = map(_linear, "__add__ __radd__ __sub__ __rsub__ __neg__".split())
+    __mul__, __rmul__, __truediv__ = map(_scaled, "__mul__ __rmul__ __truediv__".split())
 
     def __init__(self, value, of, k):
         super().__init__(value)
@@ -318,7 +331,8 @@ class Coordinates:
         Returns
         -------
         SX of the same shape
-            A residual that is the sum of it and functions of time has the expression as its integral.
+            A residual that is a sum of it, or of multiples by numbers, and functions of time knows its integral. Written
+            in another way it does not: state that by `Program(..., integrals={"row": expression})`.
         """
         items = column(expression, "the expression")
         result = ca.vertcat(*self.derivatives(items, _order(k))[k])
