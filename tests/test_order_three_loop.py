@@ -110,6 +110,13 @@ def test_the_loop_of_a_plan_alone_and_under_lqr(spirals):
     assert np.array_equal(loop.to_run().residual["kappa"], held)
 
 
+def test_a_loop_of_few_samples_has_no_quotient():
+    """Two or three middles have no third difference: there is one level, not a second one of NaN."""
+    law = mass([-8.0, -10.0, -13.0])[1]
+    shapes = [closed(law, span=(0.0, end)).residual["jerk"].shape for end in (0.002, 0.003, 0.004)]
+    assert shapes == [(1, 3), (1, 4), (2, 5)]
+
+
 # followed --------------------------------------------------------------------------------------------------------
 
 

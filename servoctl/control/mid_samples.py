@@ -23,7 +23,7 @@ def program_rows(run):
     for name, order in late.items():
         k, edge = powers.get(name, 0), (order > 2) * (order + 1) // 2
         row = at[name][:, edge : len(t) - edge]
-        row = np.vstack([row, quotient(row[0], k, run.loop.period)]) if k else row
+        row = np.vstack([row, quotient(row[0], k, run.loop.period)]) if 0 < k < row.shape[1] else row
         rows[name] = _widened(row, len(run.t))
     return {name: row for name, row in rows.items() if row.size}
 
@@ -52,9 +52,9 @@ def _widened(values, count):
 
 
 def quotient(e, k, period):
-    """The k-th difference quotient of e (N,) about each instant, over windows of 0.1 s or a k-th of a shorter loop."""
+    """The k-th difference quotient of e (N > k,) about each instant, over windows of 0.1 s, in short loops a k-th."""
     steps = max(min(round(WINDOW / period), (len(e) - 1) // k), 1)
     values = e
     for _ in range(k):
         values = (values[steps:] - values[:-steps]) / (steps * period)
-    return _widened(values, len(e)) if len(values) else np.full(len(e), np.nan)
+    return _widened(values, len(e))

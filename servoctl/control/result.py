@@ -202,8 +202,8 @@ class Closed(Sampled, Value):
         Levels are the residual and its derivatives up to the velocities, at the plant's states and parameters. A
         residual of order 2 is evaluated in the middle of each sample; so is F of a residual of order 3 or more that is
         its k-th derivative: its levels are F minus F along the plan, and the k-th difference quotient of that, which is
-        the residual, over windows of 0.1 s. One without F is evaluated with central differences of the velocities. The
-        last sample, which has no middle, has the values of the one before.
+        the residual, over windows of 0.1 s, if there are more than k middles. One without F is evaluated with central
+        differences of the velocities. The last sample, which has no middle, has the values of the one before.
         """
         residuals = program_rows(self) if self.plan is not None else {}
         if self.plant.constrained:

@@ -16,6 +16,8 @@ from servoctl.units import units_by_name
 
 _lock = threading.Lock()
 
+MULTIPLES = ("__mul__", "__rmul__", "__truediv__")
+
 MOST_ORDER = 100  # of a derivative: k! of higher ones leaves the range of doubles soon
 
 
@@ -45,25 +47,16 @@ class Column(ca.SX):
             return super().__array_function__(func, (ca.SX,), args, kwargs)
 
 
-def _linear(name):
-    """A linear operation of SX that finds the antiderivative, too; what has none counts as a function of time."""
+def _kept(name):
+    """A sum or multiple of SX that keeps the antiderivative; in sums what has none counts as a function of time."""
+    multiple = name in MULTIPLES
 
     def applied(self, *others):
         operation = getattr(ca.SX, name)
-        value, of = operation(self, *others), operation(self.of, *(getattr(one, "of", 0) for one in others))
-        same = value.shape == self.shape and all(getattr(one, "k", self.k) == self.k for one in others)
-        return Rate(value, of, self.k) if same else value
-
-    return applied
-
-
-def _scaled(name):
-    """A product or quotient of SX that keeps the antiderivative where the other factor is a number."""
-
-    def applied(self, factor):
-        operation = getattr(ca.SX, name)
-        value = operation(self, factor)
-        return Rate(value, operation(self.of, factor), self.k) if is_number(factor) else value
+        ofs = (getattr(one, "of", one if multiple else 0) for one in others)
+        value, of = operation(self, *others), operation(self.of, *ofs)
+        known = (is_number(one) if multiple else getattr(one, "k", self.k) == self.k for one in others)
+        return Rate(value, of, self.k) if value.shape == self.shape and all(known) else value
 
     return applied
 
@@ -72,8 +65,8 @@ class Rate(ca.SX):
     """A k-th total derivative that knows its antiderivative `of`, which sums and multiples by numbers keep."""
 
     __array_ufunc__ = None  # numbers of NumPy leave operations to it
-    __add__, __radd__, __sub__, __rsub__, __neg__ = map(_linear, "__add__ __radd__ __sub__ __rsub__ __neg__".split())
-    __mul__, __rmul__, __truediv__ = map(_scaled, "__mul__ __rmul__ __truediv__".split())
+    __add__, __radd__, __sub__, __rsub__, __neg__ = map(_kept, "__add__ __radd__ __sub__ __rsub__ __neg__".split())
+    __mul__, __rmul__, __truediv__ = map(_kept, MULTIPLES)
 
     def __init__(self, value, of, k):
         super().__init__(value)
@@ -331,8 +324,8 @@ class Coordinates:
         Returns
         -------
         SX of the same shape
-            A residual that is a sum of it, or of multiples by numbers, and functions of time knows its integral. Written
-            in another way it does not: state that by `Program(..., integrals={"row": expression})`.
+            A residual that is a sum of it, or of multiples by numbers, and functions of time knows its integral, in any
+            other form it does not: state that by `Program(..., integrals={"row": expression})`.
         """
         items = column(expression, "the expression")
         result = ca.vertcat(*self.derivatives(items, _order(k))[k])
