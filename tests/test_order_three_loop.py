@@ -13,6 +13,7 @@ from servoctl.errors import NameUnknown, ServoError, SpecificationError, Unstabl
 from servoctl.gallery import gallery, vtol
 from servoctl.interop import nlsys, start
 from servoctl.methods import Adaptive
+from servoctl.shell.loop import facts
 from servoctl.spec.integrals import integrals
 
 FINE = Adaptive("DOP853", rtol=1e-12, atol=1e-13)  # plans whose own error is no part of a quotient over one sample
@@ -107,7 +108,20 @@ def test_the_loop_of_a_plan_alone_and_under_lqr(spirals):
     assert alone[0, -1] == pytest.approx(0.494, rel=0.01) and abs(held[0, -1]) < 1e-3
     loop = closed(sv.lqr(spirals, plant, rate=1000.0))
     assert "shown as F − F along the plan: kappa" in str(loop)
-    assert np.array_equal(loop.to_run().residual["kappa"], held)
+    run = loop.to_run()
+    assert np.array_equal(run.residual["kappa"], held)
+    worst = max((np.abs(values[0]).max(), name) for name, values in loop.residual.items())
+    assert f"largest residual {worst[0]:.1e} ({worst[1]})" in str(run)
+
+
+def test_figures_and_reports_say_what_is_shown(curved):
+    figures = pytest.importorskip("servoctl.figures")
+    loop = closed(curved, span=(0.0, 0.2))
+    assert loop.by_F == ("kappa",) and facts(loop)["as F minus F along the plan"] == ["kappa"]
+    labels = [ax.get_ylabel() for ax in figures.closed(loop)]
+    assert labels[:2] == ["residuals, SI", "F − F along the plan, SI"]
+    words = {text.get_text() for text in figures.residuals(loop.to_run()).get_legend().get_texts()}
+    assert words >= {"residual, or F − F along the plan", "1st derivative, or k-th quotient of F"}
 
 
 def test_a_loop_of_few_samples_has_no_quotient():
@@ -126,7 +140,7 @@ def test_the_error_of_a_row_obeys_its_poles(spirals, curved):
     loop = closed(curved)
     assert loop.residual["kappa"][0, -1] == pytest.approx(-0.01, rel=0.01)
     assert np.hypot(loop.error["x"][-1], loop.error["y"][-1]) == pytest.approx(0.034, rel=0.02)
-    assert curved.info["free"] == "not fed back, free to drift: x, y, dx"
+    assert curved.info["free"] == "x, y, dx are not fed back and drift"
     twice = sv.computed(spirals, plant, rate=1000.0, poles={"kappa": 2 * SLOW, "speed": SLOW})
     assert abs(closed(twice).residual["kappa"][0, -1]) < 1e-6
     second = spiral(2, 0.25)

@@ -462,7 +462,8 @@ def computed(
     info = {"orders": orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {len(values)}" for name, values in poles.items())
     if internal.verdict == "neutral":
-        info["free"] = f"not fed back, free to drift: {', '.join(internal.names)}"
+        drift = "are not fed back and drift" if len(internal.names) > 1 else "is not fed back and drifts"
+        info["free"] = f"{', '.join(internal.names)} {drift}"
     return Law(
         name="computed",
         measures=plant.state_names,

@@ -17,9 +17,10 @@ from servoctl.errors import SpecificationError
 from servoctl.markup import fitted, listed
 from servoctl.model.start import without_rounding
 from servoctl.plants.plant import Plant
-from servoctl.run import Run, Sampled, range_in_words
+from servoctl.run import CLOSED_LOOP, Run, Sampled, range_in_words
 from servoctl.values import Value, frozen, read_only
 
+ALONG = "F − F along the plan"  # what is shown of a residual that is the k-th derivative of F
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
 
@@ -212,6 +213,12 @@ class Closed(Sampled, Value):
         return residuals
 
     @cached_property
+    def by_F(self) -> tuple[str, ...]:
+        """Names of the residuals that are shown as F minus F along the plan."""
+        program = self.plan is not None and self.plan.model and self.plan.model.reduction.program.names
+        return tuple(known_residuals(self.plan.model, self.plant).integrated) if program else ()
+
+    @cached_property
     def error(self) -> Mapping[str, np.ndarray]:
         """States minus those of the plan (after its end, minus its last ones), by name; empty without a plan."""
         if self.plan is None:
@@ -270,7 +277,7 @@ class Closed(Sampled, Value):
             self.states,
             p.state_names,
             None,
-            f"closed loop: {self.law.name}",
+            f"{CLOSED_LOOP}{self.law.name}",
             "",
             self._counters,
             self.success,
@@ -346,9 +353,8 @@ class Closed(Sampled, Value):
             ends = [f"{name} {sizes[name].max():.3g} / {sizes[name][-1]:.3g}" for name in order]
             lines.append("max / final residual: " * bool(ends) + "; ".join(ends if full else ends[:3]))
             program = self.plan.model.reduction.program.names if self.plan is not None and self.plan.model else ()
-            read = known_residuals(self.plan.model, self.plant).integrated if program else {}
             for what, names in (
-                ("shown as F − F along the plan:", [n for n in sizes if n in read]),
+                (f"shown as {ALONG}:", [n for n in sizes if n in self.by_F]),
                 ("not evaluated, as the loop has too few samples:", [n for n in program if n not in sizes]),
             ):
                 lines.append(fitted(lambda room: f"{what} {listed(names, room)}", full) * bool(names))  # noqa: B023
