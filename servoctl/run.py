@@ -518,8 +518,7 @@ class Run(Sampled, Value):
         if not len(self.t):
             return [f"Run: no samples; {self.message}"]
         outcome, _, note = self.message.partition("; ")
-        # of a loop, further levels are derivatives that its samples disturb, and quotients
-        levels = slice(1 if self.method.startswith(CLOSED_LOOP) else None)
+        levels = slice(1 if self.method.startswith(CLOSED_LOOP) else None)  # further ones are disturbed by the samples
         worst = {name: float(np.abs(self.residual[name][levels]).max(initial=0.0)) for name in self.residual}
         residuals = [f"{worst[name]:.1e} ({name})" for name in sorted(worst, key=worst.get, reverse=True)]
         method = f"method {self.method}" + (f", drift: {self.drift}" if self.drift else "")
@@ -545,8 +544,10 @@ class Run(Sampled, Value):
         counted = [f"{name} {count}" for name, count in self.counters.items() if count]
         longest = [np.abs(np.diff(piece.t)).max() for piece in self.steps]
         yield ", ".join(counted + ([f"longest step {max(longest):.3g} s"] if longest else []))
-        over = "" if self.method.startswith(CLOSED_LOOP) else " over all levels"
-        yield f"largest residuals{over}: {', '.join(residuals)}" * bool(residuals)
+        yield (
+            f"largest residuals{'' if self.method.startswith(CLOSED_LOOP) else ' over all levels'}: "
+            f"{', '.join(residuals)}"
+        ) * bool(residuals)
 
 
 def range_in_words(name, low, t_low, high, t_high, unit):

@@ -140,7 +140,7 @@ def test_the_error_of_a_row_obeys_its_poles(spirals, curved):
     loop = closed(curved)
     assert loop.residual["kappa"][0, -1] == pytest.approx(-0.01, rel=0.01)
     assert np.hypot(loop.error["x"][-1], loop.error["y"][-1]) == pytest.approx(0.034, rel=0.02)
-    assert curved.info["free"] == "x, y, dx are not fed back and drift"
+    assert curved.info["free"] == "x, y, dx: not fed back, free to drift"
     twice = sv.computed(spirals, plant, rate=1000.0, poles={"kappa": 2 * SLOW, "speed": SLOW})
     assert abs(closed(twice).residual["kappa"][0, -1]) < 1e-6
     second = spiral(2, 0.25)

@@ -56,8 +56,7 @@ class Companion:
                 )
         rows = in_symbols_of(plant, model, read)  # in symbols that `beside` shares
         self.q = plant.mechanism.q.beside(**dict.fromkeys(follow))[0] if follow else plant.mechanism.q
-        off = {name: rows[name] - self.q.family.jet(name + SUFFIX, 0) for name in powers}
-        self.rows = rows | {name: without_turns(ca.SX(e)) for name, e in off.items()}
+        self.rows = rows | {n: without_turns(ca.SX(rows[n] - self.q.family.jet(n + SUFFIX, 0))) for n in powers}
         self.paths, self.powers = paths_along(model, plant) | follow, dict.fromkeys(rows, 0) | powers
 
 
@@ -201,5 +200,4 @@ def sampled_bound(rho, delay=0):
     SpecificationError
         If ρ is not a whole number from 1 to 12, or the delay not from 0 to 12.
     """
-    n = whole_of("rho", rho, range(1, 13))
-    return fastest_poles(n, n, whole_of("delay", delay, range(13)))
+    return fastest_poles(whole_of("rho", rho, range(1, 13)), None, whole_of("delay", delay, range(13)))

@@ -462,8 +462,7 @@ def computed(
     info = {"orders": orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {len(values)}" for name, values in poles.items())
     if internal.verdict == "neutral":
-        drift = "are not fed back and drift" if len(internal.names) > 1 else "is not fed back and drifts"
-        info["free"] = f"{', '.join(internal.names)} {drift}"
+        info["free"] = f"{', '.join(internal.names)}: not fed back, free to drift"
     return Law(
         name="computed",
         measures=plant.state_names,

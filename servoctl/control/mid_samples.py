@@ -14,8 +14,7 @@ WINDOW = 0.1  # s of a difference quotient: noise σ of F becomes √2 σ/H in t
 def program_rows(run):
     """Residuals of the plan's program along a loop, (levels, N) by name; without those for which it is too short."""
     known, powers = known_residuals(run.plan.model, run.plant), as_read(run.plan.model)[1]
-    further = np.zeros((run.plant.mechanism.q.n * (known.order - 1), len(run.t)))
-    rows = known.levels(run.t, np.vstack([run.states, further]), run.plan)
+    rows = known.levels(run.t, np.pad(run.states, [(0, run.plant.mechanism.q.n * (known.order - 1)), (0, 0)]), run.plan)
     late = {name: order for name, order in zip(known.names, known.orders, strict=True) if order > 1 or name in powers}
     if late:
         t, jets = _middles(run, known.order)

@@ -78,8 +78,9 @@ class Residuals:
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         chosen = in_symbols_of(plant, model, {name: residuals[name] for name in self.names})
         self._read = ca.vertcat(*chosen.values())  # angles without the planned ones may be whole turns off
-        off = {name: without_turns(ca.SX(chosen[name] - planned)) for name, planned in along.items() if name in chosen}
-        self.expressions = ca.vertcat(*(chosen | off).values())
+        self.expressions = ca.vertcat(
+            *(without_turns(ca.SX(e - along[name])) if name in along else e for name, e in chosen.items())
+        )
         self._q, self._state = plant.mechanism.q, plant.equations.state
         parameters = plant.mechanism.parameters.symbols
         self.places = tuple(i for i, s in enumerate(parameters) if ca.depends_on(self.expressions, s))
@@ -133,9 +134,9 @@ class Residuals:
             items = zip(self.expressions.elements(), counts, strict=True)
             return [level[0] for e, count in items for level in self._q.derivatives([e], count - 1)]
 
-        f, planned = self._function("residual_levels", outputs), self.along(plan, t).values()
-        p = np.vstack([np.tile(self._p[: len(self._p) - len(planned), None], len(t)), *planned])
-        values = f.grid(t, x, p)
+        numbers, planned = self._p[: len(self._p) - len(self.planned), None], self.along(plan, t).values()
+        p = np.vstack([np.tile(numbers, len(t)), *planned])
+        values = self._function("residual_levels", outputs).grid(t, x, p)
         ends = np.cumsum([0, *counts])
         return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
 

@@ -215,8 +215,8 @@ class Closed(Sampled, Value):
     @cached_property
     def by_F(self) -> tuple[str, ...]:
         """Names of the residuals that are shown as F minus F along the plan."""
-        program = self.plan is not None and self.plan.model and self.plan.model.reduction.program.names
-        return tuple(known_residuals(self.plan.model, self.plant).integrated) if program else ()
+        model = getattr(self.plan, "model", None)
+        return () if model is None else tuple(known_residuals(model, self.plant).integrated)
 
     @cached_property
     def error(self) -> Mapping[str, np.ndarray]:

@@ -29,7 +29,6 @@ from servoctl.spec.shapes import heights
 from servoctl.units import unit_of
 
 SOURCE = "sv.simulate(...) or sv.load(path)"
-LOOPED = ("residual, or F − F along the plan", "1st derivative, or k-th quotient of F")  # levels of a closed loop
 LEAST = 1e-18  # residual drawn for exact zeros on the logarithmic scale
 BINS = 100  # bins of time, each drawn by the greatest magnitude in it: rounding becomes a line
 LAST, UNBOUNDED = 0.01, 2.0  # a signal that doubles its range in the last hundredth of a stopped run leaves the frame
@@ -345,8 +344,8 @@ def _keys(ax, names, levels, looped):
     from matplotlib.lines import Line2D
 
     colours = [Line2D([], [], color=COLOURS[i % len(COLOURS)], label=name) for i, name in enumerate(names)]
-    words = [*(LOOPED if looped else ("residual", "1st derivative")), "2nd derivative", "3rd derivative"]
-    words += [f"{j}th derivative" for j in range(4, levels)]
+    words = ["residual" + ", or F − F along the plan" * looped, "1st derivative" + ", or k-th quotient of F" * looped]
+    words += ["2nd derivative", "3rd derivative", *(f"{j}th derivative" for j in range(4, levels))]
     styles = [
         Line2D([], [], color="black", linestyle=STYLES[j % len(STYLES)], label=words[j])
         for j in range(levels if levels > 1 else 0)

@@ -49,14 +49,13 @@ class Column(ca.SX):
 
 def _kept(name):
     """A sum or multiple of SX that keeps the antiderivative; in sums what has none counts as a function of time."""
-    multiple = name in MULTIPLES
+    operation, multiple = getattr(ca.SX, name), name in MULTIPLES
 
     def applied(self, *others):
-        operation = getattr(ca.SX, name)
-        ofs = (getattr(one, "of", one if multiple else 0) for one in others)
-        value, of = operation(self, *others), operation(self.of, *ofs)
-        known = (is_number(one) if multiple else getattr(one, "k", self.k) == self.k for one in others)
-        return Rate(value, of, self.k) if value.shape == self.shape and all(known) else value
+        value = operation(self, *others)
+        of = operation(self.of, *(getattr(one, "of", one if multiple else 0) for one in others))
+        same = all(is_number(one) if multiple else getattr(one, "k", self.k) == self.k for one in others)
+        return Rate(value, of, self.k) if same and value.shape == self.shape else value
 
     return applied
 
