@@ -54,7 +54,7 @@ HOMES = {  # of each public name: the module that defines it, or that it is; imp
     "report": "inversion.report",
     "rigid_body": "spec.bodies",
     "rotations": "spec.rotations",
-    "sampled_bound": "methods.stability",
+    "sampled_bound": "control.companion",
     "sensitivity": "sensitivities.sensitivity",
     "shapes": "spec.shapes",
     "simulate": "simulation",

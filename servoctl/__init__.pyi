@@ -8,6 +8,7 @@ from servoctl import programs as programs
 from servoctl import types as types
 from servoctl.control import disturbances as disturbances
 from servoctl.control.close import close as close
+from servoctl.control.companion import sampled_bound as sampled_bound
 from servoctl.control.conditions import Sensors as Sensors
 from servoctl.control.conditions import Timing as Timing
 from servoctl.control.feedforward import feedforward as feedforward
@@ -27,7 +28,6 @@ from servoctl.inversion.output import minimum_phase as minimum_phase
 from servoctl.inversion.relaxed import relaxed as relaxed
 from servoctl.inversion.report import report as report
 from servoctl.methods.events import Event as Event
-from servoctl.methods.stability import sampled_bound as sampled_bound
 from servoctl.model.model import derive as derive
 from servoctl.plants.plant import plant as plant
 from servoctl.robots.contact import held as held

@@ -25,6 +25,7 @@ from servoctl.reduction.idle import names_of
 from servoctl.units import unit_of
 from servoctl.values import Value, frozen, read_only, same
 
+CLOSED_LOOP = "closed loop: "  # the method of a loop as a run, before the name of its law
 SAME_TIME = 1e-12  # relative: rounding of an instant
 AGREES = 1e-6  # relative: difference of a signal in a file from that of a model, below which the run is of this model
 FACTS = {
@@ -517,7 +518,8 @@ class Run(Sampled, Value):
         if not len(self.t):
             return [f"Run: no samples; {self.message}"]
         outcome, _, note = self.message.partition("; ")
-        worst = {name: float(np.abs(self.residual[name]).max(initial=0.0)) for name in self.residual}
+        levels = slice(1 if self.method.startswith(CLOSED_LOOP) else None)  # further ones are disturbed by the samples
+        worst = {name: float(np.abs(self.residual[name][levels]).max(initial=0.0)) for name in self.residual}
         residuals = [f"{worst[name]:.1e} ({name})" for name in sorted(worst, key=worst.get, reverse=True)]
         method = f"method {self.method}" + (f", drift: {self.drift}" if self.drift else "")
         lines = [
@@ -542,7 +544,10 @@ class Run(Sampled, Value):
         counted = [f"{name} {count}" for name, count in self.counters.items() if count]
         longest = [np.abs(np.diff(piece.t)).max() for piece in self.steps]
         yield ", ".join(counted + ([f"longest step {max(longest):.3g} s"] if longest else []))
-        yield f"largest residuals over all levels: {', '.join(residuals)}" * bool(residuals)
+        yield (
+            f"largest residuals{'' if self.method.startswith(CLOSED_LOOP) else ' over all levels'}: "
+            f"{', '.join(residuals)}"
+        ) * bool(residuals)
 
 
 def range_in_words(name, low, t_low, high, t_high, unit):

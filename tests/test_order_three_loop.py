@@ -7,12 +7,13 @@ from refusals import refused
 from test_export_law import InC, close_to
 
 import servoctl as sv
-from servoctl.control.companion import fastest_poles
+from servoctl.control.companion import fastest_poles, sampled_radius
 from servoctl.control.inverse_dynamics import _Extension
-from servoctl.errors import NameUnknown, SpecificationError, UnstableInternalDynamics
+from servoctl.errors import NameUnknown, ServoError, SpecificationError, UnstableInternalDynamics
 from servoctl.gallery import gallery, vtol
 from servoctl.interop import nlsys, start
 from servoctl.methods import Adaptive
+from servoctl.shell.loop import facts
 from servoctl.spec.integrals import integrals
 
 FINE = Adaptive("DOP853", rtol=1e-12, atol=1e-13)  # plans whose own error is no part of a quotient over one sample
@@ -106,8 +107,28 @@ def test_the_loop_of_a_plan_alone_and_under_lqr(spirals):
     alone, held = (closed(make(spirals, plant, rate=1000.0)).residual["kappa"] for make in (sv.feedforward, sv.lqr))
     assert alone[0, -1] == pytest.approx(0.494, rel=0.01) and abs(held[0, -1]) < 1e-3
     loop = closed(sv.lqr(spirals, plant, rate=1000.0))
-    assert "read by what they are derivatives of, minus that along the plan: kappa" in str(loop)
-    assert np.array_equal(loop.to_run().residual["kappa"], held)
+    assert "shown as F − F along the plan: kappa" in str(loop)
+    run = loop.to_run()
+    assert np.array_equal(run.residual["kappa"], held)
+    worst = max((np.abs(values[0]).max(), name) for name, values in loop.residual.items())
+    assert f"largest residual {worst[0]:.1e} ({worst[1]})" in str(run)
+
+
+def test_figures_and_reports_say_what_is_shown(curved):
+    figures = pytest.importorskip("servoctl.figures")
+    loop = closed(curved, span=(0.0, 0.2))
+    assert loop.by_F == ("kappa",) and facts(loop)["as F minus F along the plan"] == ["kappa"]
+    labels = [ax.get_ylabel() for ax in figures.closed(loop)]
+    assert labels[:2] == ["residuals, SI", "F − F along the plan, SI"]
+    words = {text.get_text() for text in figures.residuals(loop.to_run()).get_legend().get_texts()}
+    assert words >= {"residual, or F − F along the plan", "1st derivative, or k-th quotient of F"}
+
+
+def test_a_loop_of_few_samples_has_no_quotient():
+    """Two or three middles have no third difference: there is one level, not a second one of NaN."""
+    law = mass([-8.0, -10.0, -13.0])[1]
+    shapes = [closed(law, span=(0.0, end)).residual["jerk"].shape for end in (0.002, 0.003, 0.004)]
+    assert shapes == [(1, 3), (1, 4), (2, 5)]
 
 
 # followed --------------------------------------------------------------------------------------------------------
@@ -119,7 +140,7 @@ def test_the_error_of_a_row_obeys_its_poles(spirals, curved):
     loop = closed(curved)
     assert loop.residual["kappa"][0, -1] == pytest.approx(-0.01, rel=0.01)
     assert np.hypot(loop.error["x"][-1], loop.error["y"][-1]) == pytest.approx(0.034, rel=0.02)
-    assert "3 of 4 states are not fed back" in curved.info["free"]
+    assert curved.info["free"] == "x, y, dx: not fed back, free to drift"
     twice = sv.computed(spirals, plant, rate=1000.0, poles={"kappa": 2 * SLOW, "speed": SLOW})
     assert abs(closed(twice).residual["kappa"][0, -1]) < 1e-6
     second = spiral(2, 0.25)
@@ -208,6 +229,26 @@ def test_noise_in_the_curvature(curved):
     assert loop.residual["kappa"][0].std() == pytest.approx(5.5e-3, rel=0.1)
 
 
+def test_an_angle_is_followed_through_whole_turns():
+    """The error of F = atan2 jumps by no turn where the plan and the machine pass π one after the other."""
+    body, _ = particle()
+    dx, dy = body.q.d(1)
+    rows = {"heading": body.q.dt(ca.atan2(dy, dx), 2) - 0.5, "speed": body.q.dt(ca.sqrt(dx**2 + dy**2), 2) - 0.1}
+    start = {"x": 0.0, "y": 0.0, "dx": 1.0, "dy": 0.0, "d2x": 0.0, "d2y": 0.0}
+    plan = planned(body, sv.Program(rows), (0.0, 4.0), **start)
+    law = sv.computed(plan, sv.plant(body), rate=1000.0, poles={"heading": 2 * SLOW, "speed": 2 * SLOW})
+    loop = closed(law)
+    assert loop.residual["heading"][0, -1] == pytest.approx(-0.1 * 0.5 / 25, rel=0.02)
+    assert np.abs(loop.residual["heading"]).max() < 0.05 and np.abs(loop.inputs).max() < 10.0
+    off = np.array([0.0, 0.0, 0.0, 0.05])  # the machine turns ahead
+    integral = sv.lqr(plan, sv.plant(body), rate=1000.0, integral={"heading": 1.0})
+    loop = closed(integral, off=off)
+    assert np.abs(loop.residual["heading"][0]).max() < 0.1
+    assert np.abs(loop.signal["integral of heading"]).max() < 0.1
+    west = planned(body, sv.Program(rows), (0.0, 0.1), **start | {"dx": -1.0})
+    assert np.isfinite(closed(sv.lqr(west, sv.plant(body), rate=1000.0, integral={"heading": 1.0})).inputs).all()
+
+
 # sampled ---------------------------------------------------------------------------------------------------------
 
 
@@ -245,6 +286,19 @@ def test_bounds_of_sums_and_integrators():
     }  # fmt: skip
     for (delay, r), bounds in table.items():
         assert [fastest_poles(n, r, delay) for n in range(r, r + 4)] == pytest.approx(bounds, rel=2e-4, abs=5e-5)
+
+
+def test_bounds_of_long_delays():
+    """One integrator under feedback that is d samples late: p h = 2 sin(π/(4d + 2))."""
+    for delay in (10, 25, 100, 1000):
+        assert fastest_poles(1, 1, delay) == pytest.approx(2 * np.sin(np.pi / (4 * delay + 2)), rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [2, 4, 6, 8, 12])
+def test_slow_poles_are_stable(n):
+    """The slowest of n equal poles under the hold, 1 + p h s with s near -1; their spread is of the order of (p h)^(1/n)."""
+    for step in (1e-1, 1e-3, 1e-5):
+        assert -1.0 < (sampled_radius(np.full(n, -step), 1.0) - 1) / step < -0.5
 
 
 def test_sums_stop_at_a_limit(spirals, curved):
@@ -331,6 +385,9 @@ def test_in_lanes_and_in_python_control(curved):
     system = nlsys(short)
     found = control.input_output_response(system, short.t, np.zeros((system.ninputs, len(short.t))), start(short))
     assert np.abs(found.outputs[0] - short["x"]).max() < 1e-12
+    at_rest = np.concatenate([np.zeros(4), start(short)[4:]])  # where a curvature has no value
+    with refused(ServoError, "returned NaN", name="computed", t=0.0):
+        control.input_output_response(system, short.t, np.zeros((system.ninputs, len(short.t))), at_rest)
 
 
 def test_internal_dynamics_are_those_of_what_is_fed_back():
@@ -362,13 +419,26 @@ def test_a_lag_measures_what_it_delays(spirals):
     assert loop.residual["kappa"][0, -1] == pytest.approx(-0.02, rel=0.02)
 
 
+def test_a_lag_measures_a_row_of_accelerations():
+    """A row of order 2 behind lags is the model's, too: without a sum of what is measured 10 % of it are lost."""
+    body, _ = particle()
+    plan = planned(body, sv.Program({"a": body.q.d(2)[0] - 1.0, "level": body.q[1]}), (0.0, 1.0), x=0.0, dx=0.0)
+    lag = {"fx": 0.02, "fy": 0.02}
+    law = sv.computed(plan, sv.plant(body, lag=lag), rate=500.0, poles=0.1)
+    assert law.info["orders"] == {"a": 2, "level": 3}
+    begun = np.append(plan.state(0.0), [plan["fx"][0], plan["fy"][0]])
+    loop = sv.close(sv.plant(body, m=1.1, lag=lag), law, begun, plan.span)
+    assert abs(loop.residual["a"][0, -1]) < 3e-4
+
+
 # which F ---------------------------------------------------------------------------------------------------------
 
 
 def test_an_integral_is_found_where_it_was_written():
     body, place = particle()
     (x, y), q = place.elements(), body.q
-    for row, F in ((q.dt(x, 3) - 2.0, x), (1.0 - q.dt(q.dt(x), 2), -x), (q.dt(place, 3)[1] + q.t, y), (q.dt(x, 3) - q.dt(y, 3), x - y)):
+    for row, F in ((np.float64(1.5) - q.dt(x, 3), -x), (2 * q.dt(x, 3) - 3.0, 2 * x), (q.dt(x, 3) / 4 + np.float64(1.0), x / 4),
+                   (q.dt(x, 3) * np.float64(0.5), 0.5 * x), (q.dt(x, 3) - 2.0, x), (1.0 - q.dt(q.dt(x), 2), -x), (q.dt(place, 3)[1] + q.t, y), (q.dt(x, 3) - q.dt(y, 3), x - y)):  # fmt: skip
         found = integrals(q, sv.Program({"row": row}))
         assert ca.is_equal(ca.simplify(found["row"] - F), ca.SX(0)) or ca.is_equal(found["row"], F, 3)
     assert not integrals(q, sv.Program({"row": q.dt(x, 3) - y})) and not integrals(q, sv.Program({"row": q.d(3)[0]}))
@@ -382,7 +452,7 @@ def test_bad_input(spirals, curved):
     q, rows, at_rest = body.q, {"level": y}, {"x": 0.0, "dx": 0.0}
     plant = sv.plant(spirals.model.reduction.mechanism)
     for poles in ([], [-5.0] * 3, [-5 + 1j]):
-        with refused(SpecificationError, "one more", name="kappa", order=1):
+        with refused(SpecificationError, "takes 1 or 2 poles", name="kappa", order=1):
             sv.computed(spirals, plant, poles={"kappa": poles, "speed": SLOW})
     with refused(SpecificationError, "left half plane", name="kappa"):
         sv.computed(spirals, plant, poles={"kappa": [5.0], "speed": SLOW})
@@ -396,7 +466,7 @@ def test_bad_input(spirals, curved):
         sv.Program({"jerk": q.d(3)[0]}, integrals={"jerky": x})
     with refused(SpecificationError, "slope", "sv.lqr", name="jerk", jet="dx"):
         sv.derive(body, sv.Program(rows | {"jerk": q.d(3)[0] - 1.0}, integrals={"jerk": x**2}))
-    with refused(SpecificationError, "order -1", name="jerk", order=-1):
+    with refused(SpecificationError, "depends on no coordinates", name="jerk", order=-1):
         sv.derive(body, sv.Program(rows | {"jerk": q.d(3)[0] - 1.0}, integrals={"jerk": q.t}))
     bare = planned(body, sv.Program(rows | {"jerk": q.d(3)[0] - 1.0}), (0.0, 0.2), **at_rest)
     with refused(SpecificationError, "sv.lqr", name="jerk", order=3):
@@ -404,8 +474,12 @@ def test_bad_input(spirals, curved):
     rough = sv.Program(rows | {"jerk": q.d(3)[0] - 1.0}, integrals={"jerk": q.d(1)[0] ** 2 / q.d(1)[0]})
     with refused(SpecificationError, "sv.lqr", name="jerk", t=0.0):
         sv.computed(planned(body, rough, (0.0, 0.2), **at_rest), sv.plant(body))
+    hole = q[0] + ca.sqrt((q.t - 0.051) ** 2 - 1e-10)  # no value at one sample
+    holed = planned(body, sv.Program(rows | {"jerk": q.d(3)[0] - 1.0}, integrals={"jerk": hole}), (0.0, 0.2), **at_rest)
+    with refused(SpecificationError, "sv.lqr", name="jerk", t=pytest.approx(0.051)):
+        sv.computed(holed, sv.plant(body), rate=1000.0)
     bent = planned(body, sv.Program(rows | sv.programs.acceleration_norm("a", q, ca.vertcat(x, y), 2.0)), (0.0, 0.2), **at_rest)
-    with refused(SpecificationError, "sv.lqr", name="a"):
+    with refused(SpecificationError, "'a' is not affine", "sv.lqr", name="a"):
         sv.computed(bent, sv.plant(body))
     with refused(SpecificationError, "order 2", name="kappa"):
         sv.lqr(spirals, plant, integral={"kappa": 1.0})
@@ -419,5 +493,8 @@ def test_a_decoupling_that_loses_its_rank_is_refused():
     vars(given).update(powers={"a": 1, "b": 0}, names=("a", "b"), along=(times, None), xi=ca.SX(0, 1), turns=False, levels=[], v=ca.SX(0, 1))
     given._at = lambda *_: (lost, np.abs(lost))
     given.controller_states = lambda *_: None
-    with refused(SpecificationError, "sv.lqr", t=0.5, names=("a", "b")):
+    with refused(SpecificationError, "singular at t = 0.5 s", "sv.lqr", t=0.5, names=("a", "b")):
+        given.require_rank()
+    lost[1, 1] += 0.04
+    with refused(SpecificationError, "singular between t = 0.4 s and t = 0.5 s", "sv.lqr", t=pytest.approx(0.4)):
         given.require_rank()

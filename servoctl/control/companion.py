@@ -13,15 +13,18 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
+from servoctl.checks import whole_of
 from servoctl.codegen.function import compiled
 from servoctl.control.residuals import Along, as_read, in_symbols_of, paths_along
-from servoctl.control.sampling import discretised, spectral_radii
+from servoctl.control.sampling import discretised
 from servoctl.errors import SpecificationError
-from servoctl.methods.stability import FASTEST, HALVINGS
+from servoctl.jets.branches import without_turns
 from servoctl.model.equations import Equations
 from servoctl.model.model import Model
 
 SUFFIX = " along the plan"  # of the reference that F follows
+FASTEST, HALVINGS = 4.0, 50  # p·h at which every sampled loop is unstable; bisections
+LONG = 24  # samples of delay, beyond which 1/(p·h) is linear in the delay up to 1e-3 of it
 
 
 class Companion:
@@ -53,7 +56,7 @@ class Companion:
                 )
         rows = in_symbols_of(plant, model, read)  # in symbols that `beside` shares
         self.q = plant.mechanism.q.beside(**dict.fromkeys(follow))[0] if follow else plant.mechanism.q
-        self.rows = rows | {name: rows[name] - self.q.family.jet(name + SUFFIX, 0) for name in powers}
+        self.rows = rows | {n: without_turns(ca.SX(rows[n] - self.q.family.jet(n + SUFFIX, 0))) for n in powers}
         self.paths, self.powers = paths_along(model, plant) | follow, dict.fromkeys(rows, 0) | powers
 
 
@@ -146,25 +149,55 @@ def sampled_radius(poles, rate, delay=0, chain=None):
     """Spectral radius of feedback with poles (n,) [1/s] that is held and delayed.
 
     Of n integrators the last `chain`, default all, are those of the machine, exact under the hold; the others are sums
-    over the samples, and so is the only one of a row of relative degree 0.
+    over the samples, and so is the only one of a row of relative degree 0. The unit of time is that of the poles, and
+    eigenvalues are those of changes over a sample: slow poles are all near 1.
     """
-    n, h = len(poles), 1.0 / rate
-    r = n if chain is None else max(chain, 1)
+    n, unit = len(poles), np.exp(np.mean(np.log(np.abs(poles))))
+    r, h = n if chain is None else max(chain, 1), unit / rate
     exact, held = (part[0] for part in discretised(np.eye(r, k=1)[None], np.eye(r)[None, :, -1:], h))
-    loop = np.eye(n + delay, k=-1)
-    loop[:n] = np.eye(n, n + delay) + h * np.eye(n, n + delay, k=1)
-    loop[n - r : n] = 0.0
-    loop[n - r : n, n - r : n] = exact
-    command = np.append(-np.poly(poles).real[:0:-1], np.zeros(delay))
-    loop[n : n + 1] = command
-    loop[n - r : n] += held * (np.eye(n + delay)[-1] if delay else command)
-    return float(spectral_radii(loop[None])[0])
+    change = np.eye(n + delay, k=-1) - np.eye(n + delay)
+    change[:n] = h * np.eye(n, n + delay, k=1)
+    change[n - r : n] = 0.0
+    change[n - r : n, n - r : n] = exact - np.eye(r)
+    command = np.append(-np.poly(poles / unit).real[:0:-1], np.zeros(delay))
+    change[n : n + 1] = command - np.eye(1, n + delay, k=n)
+    change[n - r : n] += held * (np.eye(n + delay)[-1] if delay else command)
+    return float(np.abs(1.0 + np.linalg.eigvals(change)).max()) if np.isfinite(change).all() else np.inf
 
 
 def fastest_poles(n, chain, delay):
     """The fastest n equal poles, as p h, that `sampled_radius` finds stable."""
+    if delay > LONG:
+        half, whole = (1 / fastest_poles(n, chain, samples) for samples in (LONG // 2, LONG))
+        return 1 / (whole + (whole - half) * (delay - LONG) / (LONG // 2))
     low, high = 0.0, FASTEST
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if sampled_radius([-middle] * n, 1.0, delay, chain) < 1 else (low, middle)
+        low, high = (middle, high) if sampled_radius(np.full(n, -middle), 1.0, delay, chain) < 1 else (low, middle)
     return low
+
+
+def sampled_bound(rho, delay=0):
+    """The fastest poles that sampled feedback may place on a chain of integrators, as p·h.
+
+    ρ equal poles -p are placed on a ρ-fold integrator, and the feedback is held for the period h: the loop is stable
+    if and only if p·h is below this number.
+
+    Parameters
+    ----------
+    rho : int
+        Number of integrators ρ, at least 1.
+    delay : int
+        Delay of the feedback in samples: u_k = -K x_(k-delay).
+
+    Returns
+    -------
+    float
+        1, 0.6752, 0.5111, 0.4116 for ρ = 2, 3, 4, 5; with one sample of delay 0.4262, 0.2703, 0.1979, 0.1561.
+
+    Raises
+    ------
+    SpecificationError
+        If ρ is not a whole number from 1 to 12, or the delay not from 0 to 12.
+    """
+    return fastest_poles(whole_of("rho", rho, range(1, 13)), None, whole_of("delay", delay, range(13)))

@@ -132,9 +132,9 @@ class _Extension:
     def needed(self):
         """The least numbers of poles by residual: its relative degree, or the k of a row ψ = D^k F, at least one.
 
-        Behind integrators or lags an F with accelerations is known by the model alone; one pole more measures it.
+        Behind integrators or lags a row with accelerations is known by the model alone; one pole more measures it.
         """
-        by_model = {name: k > 0 and self.q.order(self.rows[name]) > 1 for name, k in self.powers.items()}
+        by_model = {name: self.q.order(row) > 1 for name, row in self.rows.items()}
         return {name: max(self.powers[name], r + (r > 0 and by_model[name]), 1) for name, r in self.orders.items()}
 
     def _require_affine(self, name, row):
@@ -142,27 +142,36 @@ class _Extension:
         bent = ca.hessian(row, self.v)[0].nonzeros()
         if bent and not vanish(spread(bent)).all():
             raise SpecificationError(
-                f"Accelerations do not enter {name!r} in proportion.",
+                f"{name!r} is not affine in the accelerations.",
                 "What is fed back by accelerations is solved for the inputs, once and for all.",
                 do="Use sv.lqr, which follows plans of any program.",
                 name=name,
             )
 
     def require_rank(self):
-        """Refuse a decoupling that loses its rank somewhere along the plan, for rows that are fed back by F."""
+        """Refuse a decoupling that loses its rank somewhere along the plan, for rows that are fed back by F.
+
+        A square matrix does so between two points, too, where the sign of its determinant changes.
+        """
         if not any(self.powers.values()):
             return
         times, states = self.along
         values = self._at(self.decoupling, times, states, self.controller_states(times, states))[0]
-        sizes = np.linalg.svd(np.moveaxis(_without_units(values).astype(float), 2, 0), compute_uv=False)[:, -1]
-        k = int(np.argmin(sizes))
-        if not sizes[k] > RANK_LOST * sizes.max():
+        matrices = np.moveaxis(_without_units(values).astype(float), 2, 0)
+        sizes = np.linalg.svd(matrices, compute_uv=False)[:, -1]
+        signs = np.sign(np.linalg.det(matrices)) if values.shape[0] == values.shape[1] else np.ones(len(times))
+        lost, turned = ~(sizes > RANK_LOST * sizes.max()), signs[1:] != signs[:-1]
+        if lost.any() or turned.any():
+            where = times[[np.argmin(sizes)]] if lost.any() else times[np.argmax(turned) :][:2]
             raise SpecificationError(
-                f"The inputs do not reach {', '.join(self.names)} one by one at t = {times[k]:.6g} s of the plan.",
+                f"The decoupling matrix of {', '.join(self.names)} is singular "
+                + ("at " if lost.any() else "between ")
+                + " and ".join(f"t = {t:.6g} s" for t in where)
+                + " of the plan.",
                 "The decoupling matrix of what is fed back has full rank along the whole plan.",
                 do="Use sv.lqr, which follows plans of any program, or keep the plan off this place.",
                 names=self.names,
-                t=float(times[k]),
+                t=float(where[0]),
             )
 
     def _rate(self, expression):
@@ -408,8 +417,9 @@ def computed(
         Samples per second [Hz].
     poles : float or dict of str to sequence of complex, optional
         One time constant T [s] (all poles at -1/T), default 0.25 s, or the poles [1/s] by residual, as many as its
-        relative degree with the extension, or as k, at least one (`law.info["orders"]`), or one more. As far as they
-        are more than the relative degree, sums of errors are fed back, which stop while an actuator is at its limit.
+        relative degree with the extension, or as k, at least one (`law.info["orders"]`, the least number), or one more.
+        Behind lags and integrators a residual with accelerations takes one pole more. As far as they are more than the
+        relative degree, sums of errors are fed back, which stop while a command exceeds the limits of `plant`.
     delay : int
         Delay of the loop in samples, for which the poles are checked.
 
@@ -433,8 +443,8 @@ def computed(
     refuse_transport(plant, "The linearisation is")
     delay = whole("delay", delay, most=MOST_DELAY)
     _require_invertible(plan.model.reduction, plant)
-    rows = Companion(plan, plant, np.linspace(plan.t[0], plan.t[-1], PLAN_POINTS))
-    _require_stable(without_errors(plan) if any(rows.powers.values()) else plan)
+    rows = Companion(plan, plant, reference.t)
+    internal = _stable(without_errors(plan) if any(rows.powers.values()) else plan)
     linear = linearise(plan, plant, rows)
     _require_smooth(plan, linear)
     orders, degrees = linear.needed, linear.orders
@@ -451,8 +461,8 @@ def computed(
     columns = ([plant.parameters, [reference.period], u, *coefficients, r, b] for u, r, b in rows)
     info = {"orders": orders, "relative degree": linear.relative_degree, "poles": poles}
     info["error dynamics"] = ", ".join(f"{name} of order {len(values)}" for name, values in poles.items())
-    if free := plant.n_x + linear.xi.numel() - sum(degrees.values()):
-        info["free"] = f"{free} of {plant.n_x + linear.xi.numel()} states are not fed back: they are free to drift"
+    if internal.verdict == "neutral":
+        info["free"] = f"{', '.join(internal.names)}: not fed back, free to drift"
     return Law(
         name="computed",
         measures=plant.state_names,
@@ -497,11 +507,11 @@ def _require_class(plan, name, order, reference):
         )
 
 
-def _require_stable(plan):
-    """Refuse a plan whose internal dynamics are not known to be stable."""
+def _stable(plan):
+    """The internal dynamics of a plan; refuses those that are not known to be stable."""
     internal = internal_dynamics(plan)
     if internal.verdict not in ("unstable", "inconclusive"):
-        return
+        return internal
     worst, names = float(internal.eigenvalues.real.max(initial=-np.inf)), ", ".join(internal.names)
     facts = {"verdict": internal.verdict, "growth": internal.growth, "eigenvalue": worst, "states": internal.names}
     raise UnstableInternalDynamics(
@@ -533,7 +543,7 @@ def _poles(poles, orders):
         if values.shape not in ((order,), (order + 1,)) or not np.isfinite(values).all() or not _paired(values):
             raise SpecificationError(
                 f"The poles of {name!r} are {poles.get(name)!r}.",
-                f"Its error dynamics have order {order} and as many poles, or one more; complex ones in pairs.",
+                f"It takes {order} or {order + 1} poles; complex ones in pairs.",
                 do=f"Pass {order}, as {[-4.0] * order}.",
                 name=name,
                 order=order,

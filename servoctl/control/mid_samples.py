@@ -14,17 +14,15 @@ WINDOW = 0.1  # s of a difference quotient: noise σ of F becomes √2 σ/H in t
 def program_rows(run):
     """Residuals of the plan's program along a loop, (levels, N) by name; without those for which it is too short."""
     known, powers = known_residuals(run.plan.model, run.plant), as_read(run.plan.model)[1]
-    rows = known.levels(
-        run.t, np.vstack([run.states, np.zeros((run.plant.mechanism.q.n * (known.order - 1), len(run.t)))])
-    )
+    rows = known.levels(run.t, np.pad(run.states, [(0, run.plant.mechanism.q.n * (known.order - 1)), (0, 0)]), run.plan)
     late = {name: order for name, order in zip(known.names, known.orders, strict=True) if order > 1 or name in powers}
     if late:
         t, jets = _middles(run, known.order)
-        at, along = known.levels(t, jets), known.along(run.plan, t)
+        at = known.levels(t, jets, run.plan)
     for name, order in late.items():
         k, edge = powers.get(name, 0), (order > 2) * (order + 1) // 2
-        row = at[name][:, edge : len(t) - edge] - along.get(name, 0.0)
-        row = np.vstack([row, quotient(row[0], k, run.loop.period)]) if k else row
+        row = at[name][:, edge : len(t) - edge]
+        row = np.vstack([row, quotient(row[0], k, run.loop.period)]) if 0 < k < row.shape[1] else row
         rows[name] = _widened(row, len(run.t))
     return {name: row for name, row in rows.items() if row.size}
 
@@ -53,9 +51,9 @@ def _widened(values, count):
 
 
 def quotient(e, k, period):
-    """The k-th difference quotient of e (N,) about each instant, over windows of 0.1 s or a k-th of a shorter loop."""
+    """The k-th difference quotient of e (N > k,) about each instant, over windows of 0.1 s, in short loops a k-th."""
     steps = max(min(round(WINDOW / period), (len(e) - 1) // k), 1)
     values = e
     for _ in range(k):
         values = (values[steps:] - values[:-steps]) / (steps * period)
-    return _widened(values, len(e)) if len(values) else np.full(len(e), np.nan)
+    return _widened(values, len(e))

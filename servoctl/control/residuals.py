@@ -9,6 +9,7 @@ from servoctl.checks import named, rows_read
 from servoctl.codegen.function import compiled
 from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError, unknown
+from servoctl.jets.branches import without_turns
 from servoctl.model.jets import extended
 from servoctl.spec.integrals import integrals
 from servoctl.spec.references import Jets, function_of, orders_in
@@ -19,7 +20,8 @@ class Residuals:
 
     A residual of order 3 or more, which is the k-th derivative of F and a function of time, is read by F. `names`
     selects some, and may name outputs of the mechanism and states: their residual, as that of F, is the deviation from
-    the plan. `order` is the highest: 1 for functions of the state (q, γ'), 2 with accelerations; None for all.
+    the plan, without whole turns of angles. `order` is the highest: 1 for functions of the state (q, γ'), 2 with
+    accelerations; None for all, of F again the deviation.
     `rows` are residuals by name in place of the program's.
 
     Attributes
@@ -55,7 +57,9 @@ class Residuals:
             along = {name: ca.SX.sym(f"plan {name}") for name in (*planned, *integrated) if name in names}
             rows = {name: residuals[row] for name, row in read.items()}
             valid = {name: q.order(e) for name, e in (rows | planned).items()}
-            residuals = {name: (rows | planned)[name] - along.get(name, 0) for name in valid if name in names}
+            residuals = {name: (rows | planned)[name] for name in valid if name in names}
+        elif order is None:
+            along = {name: ca.SX.sym(f"plan {name}") for name in powers}
         orders = {name: q.order(e) for name, e in residuals.items()}
         self.order = order = max(2, *orders.values()) if order is None else order
         for name in names or ():
@@ -73,7 +77,10 @@ class Residuals:
         self.names = tuple(name for name in orders if orders[name] <= order)
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         chosen = in_symbols_of(plant, model, {name: residuals[name] for name in self.names})
-        self.expressions = ca.vertcat(*chosen.values())
+        self._read = ca.vertcat(*chosen.values())  # angles without the planned ones may be whole turns off
+        self.expressions = ca.vertcat(
+            *(without_turns(ca.SX(e - along[name])) if name in along else e for name, e in chosen.items())
+        )
         self._q, self._state = plant.mechanism.q, plant.equations.state
         parameters = plant.mechanism.parameters.symbols
         self.places = tuple(i for i, s in enumerate(parameters) if ca.depends_on(self.expressions, s))
@@ -115,10 +122,11 @@ class Residuals:
         self._followed = Followed([self.paths[name].held() for name in self._names])
         return np.append(self._followed.address, numbers)
 
-    def levels(self, t, x):
+    def levels(self, t, x, plan):
         """Residuals, and the derivative of those of order 0: (2, N) and (1, N) arrays by name.
 
-        `x` (n_x, N) are states of the plant at t (N,); for order 2 and more with the further jets below the states.
+        `x` (n_x, N) are states of the plant at t (N,); for order 2 and more with the further jets below the states. Of
+        those read by F it is F minus F along the plan.
         """
         counts = [1 if n in self.integrated else max(2 - k, 1) for n, k in zip(self.names, self.orders, strict=True)]
 
@@ -126,7 +134,9 @@ class Residuals:
             items = zip(self.expressions.elements(), counts, strict=True)
             return [level[0] for e, count in items for level in self._q.derivatives([e], count - 1)]
 
-        values = self._function("residual_levels", outputs).grid(t, x, self._p)
+        numbers, planned = self._p[: len(self._p) - len(self.planned), None], self.along(plan, t).values()
+        p = np.vstack([np.tile(numbers, len(t)), *planned])
+        values = self._function("residual_levels", outputs).grid(t, x, p)
         ends = np.cumsum([0, *counts])
         return {n: values[a:b] for n, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
 
@@ -139,7 +149,7 @@ class Residuals:
         """∂φ/∂x along states of the plant, (N, k, n_x)."""
 
         def outputs():
-            return [ca.vec(ca.densify(ca.jacobian(self.expressions, self._state)))]
+            return [ca.vec(ca.densify(ca.jacobian(self._read, self._state)))]
 
         values = self._function("residual_jacobian", outputs).grid(t, x, self._p)
         return values.reshape(self._state.numel(), len(self.names), len(t)).transpose(2, 1, 0)

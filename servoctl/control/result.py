@@ -17,9 +17,10 @@ from servoctl.errors import SpecificationError
 from servoctl.markup import fitted, listed
 from servoctl.model.start import without_rounding
 from servoctl.plants.plant import Plant
-from servoctl.run import Run, Sampled, range_in_words
+from servoctl.run import CLOSED_LOOP, Run, Sampled, range_in_words
 from servoctl.values import Value, frozen, read_only
 
+ALONG = "F − F along the plan"  # what is shown of a residual that is the k-th derivative of F
 NONE, LOWER, UPPER, FALLING, RISING = 0, -1, 1, -2, 2  # which limit an input has met
 
 
@@ -124,7 +125,18 @@ class Closed(Sampled, Value):
         return self.p_within(0)
 
     def p_within(self, half):
-        """Those of `p` at the start of each sample, in its middle, or at its end: `half` is 0, 1 or 2."""
+        """Those of `p` at the start of each sample, in its middle, or at its end.
+
+        Parameters
+        ----------
+        half : int
+            0, 1 or 2.
+
+        Returns
+        -------
+        (n_p, N) array
+            As `p`, in the mechanism's units.
+        """
         loop, inputs = self.loop, self.inputs
         step, stage = divmod(half * loop.substeps, 2) if half < 2 else (loop.substeps - 1, 2)
         if loop.transport is not None:
@@ -191,14 +203,20 @@ class Closed(Sampled, Value):
         Levels are the residual and its derivatives up to the velocities, at the plant's states and parameters. A
         residual of order 2 is evaluated in the middle of each sample; so is F of a residual of order 3 or more that is
         its k-th derivative: its levels are F minus F along the plan, and the k-th difference quotient of that, which is
-        the residual, over windows of 0.1 s. One without F is evaluated with central differences of the velocities. The
-        last sample, which has no middle, has the values of the one before.
+        the residual, over windows of 0.1 s, if there are more than k middles. One without F is evaluated with central
+        differences of the velocities. The last sample, which has no middle, has the values of the one before.
         """
         residuals = program_rows(self) if self.plan is not None else {}
         if self.plant.constrained:
             values = self.plant.function("constraints").grid(self.t, self.states, self.plant.p())
             residuals |= {name: value[None] for name, value in zip(self.plant.constraint_names(), values, strict=True)}
         return residuals
+
+    @cached_property
+    def by_F(self) -> tuple[str, ...]:
+        """Names of the residuals that are shown as F minus F along the plan."""
+        model = getattr(self.plan, "model", None)
+        return () if model is None else tuple(known_residuals(model, self.plant).integrated)
 
     @cached_property
     def error(self) -> Mapping[str, np.ndarray]:
@@ -259,7 +277,7 @@ class Closed(Sampled, Value):
             self.states,
             p.state_names,
             None,
-            f"closed loop: {self.law.name}",
+            f"{CLOSED_LOOP}{self.law.name}",
             "",
             self._counters,
             self.success,
@@ -335,9 +353,8 @@ class Closed(Sampled, Value):
             ends = [f"{name} {sizes[name].max():.3g} / {sizes[name][-1]:.3g}" for name in order]
             lines.append("max / final residual: " * bool(ends) + "; ".join(ends if full else ends[:3]))
             program = self.plan.model.reduction.program.names if self.plan is not None and self.plan.model else ()
-            read = known_residuals(self.plan.model, self.plant).integrated if program else {}
             for what, names in (
-                ("read by what they are derivatives of, minus that along the plan:", [n for n in sizes if n in read]),
+                (f"shown as {ALONG}:", [n for n in sizes if n in self.by_F]),
                 ("not evaluated, as the loop has too few samples:", [n for n in program if n not in sizes]),
             ):
                 lines.append(fitted(lambda room: f"{what} {listed(names, room)}", full) * bool(names))  # noqa: B023

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from servoctl.control.result import ALONG
 from servoctl.errors import SpecificationError
 from servoctl.figures.names import units_in
 from servoctl.figures.style import BESIDE, COLOURS, high, label, look, panels
@@ -75,8 +76,8 @@ def _errors(run, units):
     """(label, {name: values}) of each panel of errors."""
     groups = []
     program = {n: v[0] for n, v in run.residual.items() if n not in run.plant.constraint_names()}
-    if program:
-        groups.append(("residuals, SI", program))
+    for what, some in (("residuals, SI", program.keys() - run.by_F), (f"{ALONG}, SI", program.keys() & run.by_F)):
+        groups += [(what, {n: v for n, v in program.items() if n in some})] * bool(some)
     by_unit = {}
     for name in run.plant.mechanism.q.names:
         if name in run.error:

@@ -24,7 +24,7 @@ from servoctl.figures.style import (
     look,
     write_png,
 )
-from servoctl.run import Run
+from servoctl.run import CLOSED_LOOP, Run
 from servoctl.spec.shapes import heights
 from servoctl.units import unit_of
 
@@ -211,7 +211,7 @@ def residuals(run, ax=None):
     finish(ax, xlabel="t [s]", ylabel="|residual|, SI (1e-18: zero)", ylim=(LEAST / 2, max(10 * top, 1e-12)))
     _instants(run, [ax])
     _end(run, [ax])
-    _keys(ax, list(run.residual), levels)
+    _keys(ax, list(run.residual), levels, run.method.startswith(CLOSED_LOOP))
     return ax
 
 
@@ -339,13 +339,13 @@ def _end(run, axes):
     axes[0].set_title(f"{_ending(run)} after t = {run.t[-1]:.6g} s", fontsize="small", loc="right")
 
 
-def _keys(ax, names, levels):
-    """Legends beside the panel: a colour for each constraint, a line style for each level."""
+def _keys(ax, names, levels, looped):
+    """Legends beside the panel: a colour for each constraint, a line style for each level, in loops also those of F."""
     from matplotlib.lines import Line2D
 
     colours = [Line2D([], [], color=COLOURS[i % len(COLOURS)], label=name) for i, name in enumerate(names)]
-    words = ["residual", "1st derivative", "2nd derivative", "3rd derivative"]
-    words += [f"{j}th derivative" for j in range(4, levels)]
+    words = ["residual" + ", or F − F along the plan" * looped, "1st derivative" + ", or k-th quotient of F" * looped]
+    words += ["2nd derivative", "3rd derivative", *(f"{j}th derivative" for j in range(4, levels))]
     styles = [
         Line2D([], [], color="black", linestyle=STYLES[j % len(STYLES)], label=words[j])
         for j in range(levels if levels > 1 else 0)

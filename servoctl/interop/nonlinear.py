@@ -264,14 +264,24 @@ def _law(law, name, quantum=None):
             do="Run it with sv.close, or write it as a control.nlsys.",
             name=law.name,
         )
-    m, n_z = len(law.inputs), len(law.state)
+    m, n_z, lost = len(law.inputs), len(law.state), None
 
     def answer(t, z, y):
         return law.answer(t, np.append(quantised(y, quantum), z), law.schedule_at(t))
 
     def output(t, z, y, _):
-        u = answer(t, z, y)[:m]
-        return u if np.any(y) else np.nan_to_num(u)  # python-control asks for it at y = 0 first
+        nonlocal lost
+        u, before = answer(t, z, y)[:m], lost
+        lost = None if np.isfinite(u).all() else t
+        if lost is not None and lost == before:
+            raise ServoError(
+                f"The law {law.name!r} returned NaN or infinity at t = {t:.6g} s.",
+                "A command is a finite number at each sample.",
+                do="Check the law at this measurement.",
+                name=law.name,
+                t=float(t),
+            )
+        return u if np.any(y) else np.nan_to_num(u)  # a loop asks at y = 0 first, whatever is measured, and goes on
 
     return control.nlsys(
         (lambda t, z, y, _: answer(t, z, y)[m : m + n_z]) if n_z else None,

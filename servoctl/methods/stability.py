@@ -6,7 +6,7 @@ from math import comb, factorial, inf, pi
 
 import numpy as np
 
-from servoctl.checks import MOST_JETS, is_whole, named, whole_of
+from servoctl.checks import MOST_JETS, is_whole, named
 from servoctl.errors import SpecificationError, warn
 from servoctl.methods.accuracy import component_sizes
 from servoctl.methods.choice import ORDERS, Poles
@@ -18,7 +18,6 @@ STEP_MAPS = (*ORDERS, "DOP853", "RK45", "Taylor", "RadauIIA", "Radau")
 WITH_ORDER = ("Taylor", "RadauIIA")
 BEYOND = 1e-10  # |R| - 1 that separates roots of |R|² = 1 where |R| crosses 1 from those where it touches 1
 MANY_STEPS = 1e5  # steps of an adaptive method in a span that deserve a warning: each takes part of a millisecond
-FASTEST, HALVINGS = 4.0, 50  # p·h at which every sampled loop of two or more integrators is unstable; bisections
 POWERS, NUDGE = 6, 1e-6  # power iterations for the fastest rate, and the relative size of their deviation
 UNRESOLVED = 0.1  # of the state's size: a larger difference of a step and two half steps means that it is too long
 
@@ -91,63 +90,6 @@ def largest_explicit(method, order=None, direction=pi):
         if amplification(method, middle, order) > 1 + BEYOND:
             return float(low)
     return inf
-
-
-def sampled_bound(rho, delay=0):
-    """The fastest poles that sampled feedback may place on a chain of integrators, as p·h.
-
-    ρ equal poles -p are placed on a ρ-fold integrator, and the feedback is held for the period h: the loop is stable
-    if and only if p·h is below this number.
-
-    Parameters
-    ----------
-    rho : int
-        Number of integrators ρ, at least 1.
-    delay : int
-        Delay of the feedback in samples: u_k = -K x_(k-delay).
-
-    Returns
-    -------
-    float
-        1, 0.6752, 0.5111, 0.4116 for ρ = 2, 3, 4, 5; with one sample of delay 0.4262, 0.2703, 0.1979, 0.1561.
-
-    Raises
-    ------
-    SpecificationError
-        If ρ is not a whole number from 1 to 12, or the delay not from 0 to 12.
-
-    Notes
-    -----
-    The k-th integral of a held input has the transfer function hᵏ E_k(z) / (k! (z - 1)ᵏ) with the Eulerian polynomial
-    E_k (Åström, Hagander and Sternby 1984), so that with z = 1 + p h s the characteristic polynomial is
-    sᵖ z^delay + Σ_k binom(ρ, k) s^(ρ-k) E_k(z)/k!, of exponent ρ: (s + 1)^ρ for small p h.
-    """
-    return _sampled_bound(whole_of("rho", rho, range(1, 13)), whole_of("delay", delay, range(13)))
-
-
-@cache
-def _sampled_bound(rho, delay):
-    steps = FASTEST * 2.0 ** (-np.arange(96)[::-1] / 8)
-    unstable = next(p for p in steps if not _sampled_stable(p, rho, delay))
-    low, high = unstable / 2 ** (1 / 8), unstable
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if _sampled_stable(middle, rho, delay) else (low, middle)
-    return float(low)
-
-
-def _sampled_stable(p, rho, delay):
-    z = np.poly1d([p, 1.0])
-    polynomial = np.poly1d([1.0] + [0.0] * rho) * z**delay
-    for k in range(1, rho + 1):
-        weight = np.poly1d([comb(rho, k) / factorial(k)] + [0.0] * (rho - k))
-        polynomial += weight * np.polyval(np.poly1d(_eulerian(k)), z)
-    return bool(np.all(np.abs(1.0 + p * polynomial.roots) < 1.0))
-
-
-def _eulerian(k):
-    """Coefficients of the Eulerian polynomial E_k: 1; 1, 1; 1, 4, 1; 1, 11, 11, 1."""
-    return [sum((-1) ** j * comb(k + 1, j) * (i + 1 - j) ** k for j in range(i + 1)) for i in range(k)]
 
 
 def warn_fast_poles(method, poles, step):

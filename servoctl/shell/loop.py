@@ -115,6 +115,7 @@ def facts(closed):
         "success": closed.success,
         "message": closed.message,
         "t_end": float(closed.t[-1]),
+        "as F minus F along the plan": list(closed.by_F),
         "residuals": {n: {"worst": float(abs(e).max()), "end": float(abs(e[-1]))} for n, e in errors.items()},
         "inputs": {
             name: {

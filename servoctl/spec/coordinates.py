@@ -6,7 +6,7 @@ from math import factorial
 
 import casadi as ca
 
-from servoctl.checks import as_list, column, is_whole, mapping, matrix, named, require_kind, whole_of
+from servoctl.checks import as_list, column, is_number, is_whole, mapping, matrix, named, require_kind, whole_of
 from servoctl.errors import SpecificationError
 from servoctl.jets.identity import spread, vanish
 from servoctl.jets.series import Motion, Series, is_zero
@@ -15,6 +15,8 @@ from servoctl.spec.references import JETS, Family
 from servoctl.units import units_by_name
 
 _lock = threading.Lock()
+
+MULTIPLES = ("__mul__", "__rmul__", "__truediv__")
 
 MOST_ORDER = 100  # of a derivative: k! of higher ones leaves the range of doubles soon
 
@@ -45,22 +47,25 @@ class Column(ca.SX):
             return super().__array_function__(func, (ca.SX,), args, kwargs)
 
 
-def _linear(name):
-    """A linear operation of SX that finds the antiderivative, too; what has none counts as a function of time."""
+def _kept(name):
+    """A sum or multiple of SX that keeps the antiderivative; in sums what has none counts as a function of time."""
+    operation, multiple = getattr(ca.SX, name), name in MULTIPLES
 
     def applied(self, *others):
-        operation = getattr(ca.SX, name)
-        value, of = operation(self, *others), operation(self.of, *(getattr(one, "of", 0) for one in others))
-        same = value.shape == self.shape and all(getattr(one, "k", self.k) == self.k for one in others)
-        return Rate(value, of, self.k) if same else value
+        value = operation(self, *others)
+        of = operation(self.of, *(getattr(one, "of", one if multiple else 0) for one in others))
+        same = all(is_number(one) if multiple else getattr(one, "k", self.k) == self.k for one in others)
+        return Rate(value, of, self.k) if same and value.shape == self.shape else value
 
     return applied
 
 
 class Rate(ca.SX):
-    """A k-th total derivative that knows its antiderivative `of`, which sums keep."""
+    """A k-th total derivative that knows its antiderivative `of`, which sums and multiples by numbers keep."""
 
-    __add__, __radd__, __sub__, __rsub__, __neg__ = map(_linear, "__add__ __radd__ __sub__ __rsub__ __neg__".split())
+    __array_ufunc__ = None  # numbers of NumPy leave operations to it
+    __add__, __radd__, __sub__, __rsub__, __neg__ = map(_kept, "__add__ __radd__ __sub__ __rsub__ __neg__".split())
+    __mul__, __rmul__, __truediv__ = map(_kept, MULTIPLES)
 
     def __init__(self, value, of, k):
         super().__init__(value)
@@ -318,7 +323,8 @@ class Coordinates:
         Returns
         -------
         SX of the same shape
-            A residual that is the sum of it and functions of time has the expression as its integral.
+            A residual that is a sum of it, or of multiples by numbers, and functions of time knows its integral, in any
+            other form it does not: state that by `Program(..., integrals={"row": expression})`.
         """
         items = column(expression, "the expression")
         result = ca.vertcat(*self.derivatives(items, _order(k))[k])

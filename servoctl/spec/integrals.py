@@ -33,8 +33,9 @@ def require_integrals(q, program):
     for name, F in ((name, program.integrals[name]) for name in program.stated):
         residual, order = program.residuals[name], q.order(F)
         if not 0 <= order <= min(2, q.order(residual) - 1):
+            has = f"has order {order}, the residual {q.order(residual)}" if order >= 0 else "depends on no coordinates"
             raise SpecificationError(
-                f"The integral of {name!r} has order {order}, the residual {q.order(residual)}.",
+                f"The integral of {name!r} {has}.",
                 "F depends on the coordinates, has an order up to 2 and one below the residual's.",
                 do=f"Leave it out, or write the residual as q.dt(F, k) and state integrals={{{name!r}: F}}.",
                 name=name,
