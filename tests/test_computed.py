@@ -10,9 +10,9 @@ from refusals import refused, warned
 from scenes import point_mass
 
 import servoctl as sv
+from servoctl.control.companion import sampled_bound
 from servoctl.control.inverse_dynamics import _Extension, sampled_radius
 from servoctl.gallery import cars, gallery, mass_on_car, vtol
-from servoctl.control.companion import sampled_bound
 
 ORDERS = {  # zeros at infinity of the program's outputs (theory), which exact linearisation reaches
     "two-link-arm": (2, 2),

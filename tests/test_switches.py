@@ -379,7 +379,7 @@ def test_jumps_are_found_wherever_they_are(name):
 @pytest.mark.parametrize("method", ["Taylor", "DOP853"])
 def test_a_jump_right_before_a_switch_is_found(method):
     q = sv.coordinates("x y z")
-    (x, y, z), (ddx, ddy, ddz) = q, q.d(2)
+    (x, y, _), (ddx, ddy, ddz) = q, q.d(2)
     rows = {"p": y - 0.1 * ca.atan(1 / (q.t - 0.48)), "s": ddz - ca.sign(x - 0.5)}
     mechanism = sv.Mechanism(q, gibbs=(ddx**2 + ddy**2 + ddz**2) / 2)
     model = sv.derive(mechanism, sv.Program(rows, by="ideal"), keep=["x", "z"])

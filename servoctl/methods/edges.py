@@ -12,6 +12,7 @@ from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges
 from servoctl.methods.pieces import RESOLUTION, End, net, residuals, terms_of
 from servoctl.model.equations import invariant_names
+from servoctl.tolerances import ENTRY
 from servoctl.values import frozen
 
 PARTS = 4  # of a step, at least, at whose ends arguments are evaluated
@@ -20,9 +21,7 @@ CLOSE = 1e-8  # of its largest distance so far: an argument that comes so near h
 JUMPS = 30.0  # times its tolerance, by which a residual changes at an edge only if it jumps
 COARSE = 1e3  # times as much where steps have no tolerances
 OF_TERMS = 1e-3  # of its terms, which a residual does not reach a thousandth of the span away from an edge
-ROUNDING = 1e-13  # of the terms of a residual, multiplied out: its rounding
-DISTANCES = 0.5 ** np.arange(20, 3, -1)  # of the span: distances from an edge at which residuals are compared
-SEEN = 1e-2  # of the span: so far beyond an edge residuals are looked at
+DISTANCES = 0.5 ** np.arange(20, 6, -1)  # of the span: distances from an edge at which residuals are compared
 EXPLAINS = 1e-3  # distance of an argument from its edge that explains why a motion cannot go on
 
 
@@ -108,7 +107,7 @@ class Edges:
                 place = max(forward * at, forward * t[0]) * forward
                 error = _jump(model, at, arguments.words[i], np.where(change > after.allowed, change, 0.0))
                 return End(int(steps_of(t, place)), place, state(np.array([place]))[:, 0], error=error)
-            if abs(t[-1] - at) < SEEN * self.span:
+            if abs(t[-1] - at) < DISTANCES[-1] * self.span:
                 self.met.append((at, i, before))
         return None
 
@@ -156,7 +155,7 @@ class Edges:
         x = state(times)
         values, tolerance = residuals(model, self.tolerance, times, x)
         terms, far = terms_of(model).grid(times, x, model.p), np.abs(times - at) > self.span / RESOLUTION
-        allowed = self.jumps * tolerance + ROUNDING * terms
+        allowed = self.jumps * tolerance + ENTRY * terms
         usual = self.jumps * residuals(model, self.tolerance, *self.start)[1]
         allowed = np.where(far, np.fmin(allowed, np.fmax(usual, OF_TERMS * terms)), allowed)
         allowed = np.where(np.isfinite(values + allowed), allowed, np.inf)
