@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from servoctl.control.result import ALONG
 from servoctl.errors import SpecificationError
 from servoctl.figures.names import units_in
 from servoctl.figures.style import BESIDE, COLOURS, high, label, look, panels
@@ -76,7 +75,10 @@ def _errors(run, units):
     """(label, {name: values}) of each panel of errors."""
     groups = []
     program = {n: v[0] for n, v in run.residual.items() if n not in run.plant.constraint_names()}
-    for what, some in (("residuals, SI", program.keys() - run.by_F), (f"{ALONG}, SI", program.keys() & run.by_F)):
+    for what, some in (
+        ("residuals, SI", program.keys() - run.by_F),
+        ("F − F along the plan, SI", program.keys() & run.by_F),
+    ):
         groups += [(what, {n: v for n, v in program.items() if n in some})] * bool(some)
     by_unit = {}
     for name in run.plant.mechanism.q.names:
