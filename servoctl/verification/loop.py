@@ -7,6 +7,7 @@ from casadi import depends_on
 
 from servoctl.control.loop import FINISHED, run_loop
 from servoctl.errors import SpecificationError
+from servoctl.tolerances import ENTRY
 from servoctl.verification.result import judged, largest, numbers
 
 LOOP_LIMITS = {"loop power": 1e-3, "loop constraints": 1e-8, "loop limits": 1e-12, "loop repeated": 1e-9}  # relative
@@ -28,9 +29,9 @@ def verify_loop(closed):
     if unbalanced:
         notes.append(f"power balance: not applicable, {unbalanced}")
     elif found["loop repeated"] <= limits["loop repeated"]:
-        defect = found["loop power"] = _defect(closed, 1)
-        found["loop power halved"] = _defect(closed, 2)
-        limits["loop power halved"] = max(CONVERGES * defect, EXACT)
+        found["loop power"], rounding = _defect(closed, 1)
+        found["loop power halved"], _ = _defect(closed, 2)
+        limits["loop power halved"] = max(CONVERGES * found["loop power"], EXACT, rounding)
     if plant.constrained:
         worst = max(largest(closed.residual[name]) for name in plant.constraint_names())
         found["loop constraints"] = worst / max(1.0, np.abs(closed.states).max())
@@ -99,16 +100,19 @@ def _difference(given, again):
 
 
 def _defect(closed, finer):
-    """Defect |E - E0 - W| of the power balance, relative to the range of the energy, with steps shorter by a factor."""
+    """Defect |E - E0 - W| of the power balance with steps shorter by a factor, and the rounding of energy.
+
+    Both are relative to the range of the energy.
+    """
     plant, loop = closed.plant, _again(closed, finer)
     loop = replace(loop, x0=np.append(loop.x0, 0.0))
     status, x, *_ = run_loop(plant, closed.law.begin(), loop, rates="ode_power")
     if status != FINISHED:
-        return np.inf
+        return np.inf, 0.0
     states, work = x[:, :-1].T, x[:, -1]
     energy = plant.function("power").grid(closed.t, states, closed.p)[0]
     scale = max(np.ptp(energy), np.ptp(work), 1e-6 * np.abs(energy).max(), 1e-12)
-    return largest((energy - energy[0] - work) / scale)
+    return largest((energy - energy[0] - work) / scale), ENTRY * np.abs(energy).max() / scale
 
 
 def _excess(closed):
