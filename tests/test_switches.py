@@ -357,6 +357,16 @@ def test_loose_tolerances_make_no_jump_of_an_edge_with_a_limit(method):
     assert sv.simulate(model, start, (0.0, 30.0), sv.methods.Adaptive(method, rtol=1e-4)).success
 
 
+@pytest.mark.parametrize(("method", "drift"), [*PAIRS, ("RK8", "project")])
+def test_a_kink_is_found_where_steps_end_beside_it(method, drift):
+    """Steps shrink at the kink of x atan(1/x)/2, and their ends are projected to its other side."""
+    model, start = ideal(lambda t, x, y, dx, dy: y - 0.5 * x * ca.atan(1 / x), x=-1.0, dx=1.0)
+    with refused(sv.errors.IntegrationStopped, "divides by x", residual="p", level="D(p)") as caught:
+        sv.simulate(model, start, (0.0, 2.0), method, drift=drift)
+    assert caught.value.details["t"] == pytest.approx(1.07733, abs=1e-4)
+    assert np.all(caught.value.run["x"] < 1e-9)
+
+
 JUMPS = {  # path, where it jumps, span, method, drift
     "far from the origin": (lambda x: 1000 + 0.5 * ca.atan(1 / (x - 0.5)), 0.5, 1.0, None, None),
     "beside what is large": (lambda x: 10 * ca.sin(x) + 0.002 * ca.atan(1 / (x - 0.5)), 0.5, 1.0, "DOP853", None),

@@ -72,11 +72,12 @@ class _Side:
 class Edges:
     """The edges that a motion meets; `tolerance` is that of its states, `span` its length [s].
 
-    Steps of fixed length are `coarse`.
+    Steps of fixed length are `coarse`; states at the ends of steps may be `projected`, from one side to the other.
     """
 
-    def __init__(self, tolerance, span, coarse=False):
+    def __init__(self, tolerance, span, coarse=False, projected=False):
         self.tolerance, self.span, self.jumps = tolerance, span, JUMPS * (COARSE if coarse else 1.0)
+        self.projected = projected
         self.met = []  # beyond which residuals are still to be seen: (t, index of the argument, `_Side` before)
         self.start = None  # the first instant and state, where slopes are as usual
         self.seen = None  # the last instant and the arguments there, their largest sizes, and where they met an edge
@@ -96,11 +97,13 @@ class Edges:
 
         if self.start is None:
             self.start = t[:1], state(t[:1])
-        new = self._new(lambda times: arguments.f.grid(times, state(times), model.p), t)
-        open_ = self.met + [(at, i, self._beside(model, state, t, at, -forward)) for at, i in new]
-        self.met = []
-        for at, i, before in open_:
-            after = self._beside(model, state, t, at, forward)
+        open_, self.met = [(t, *edge) for edge in self.met], []
+        for at, i in self._new(lambda times: arguments.f.grid(times, state(times), model.p), t):
+            k = int(steps_of(t, at))
+            within = t[k : k + 2] if self.projected else t
+            open_.append((within, at, i, self._beside(model, state, within, at, -forward)))
+        for within, at, i, before in open_:
+            after = self._beside(model, state, within, at, forward)
             known = before.allowed <= 2 * after.allowed  # else it is zero as far as tolerances tell
             change = np.abs(after.residuals - np.where(known, before.residuals, 0.0))
             if (change > after.allowed).any():
@@ -149,7 +152,8 @@ class Edges:
         """
         end, m = t[-1 if side * (t[-1] - t[0]) > 0 else 0], len(invariant_names(model))
         times = at + side * self.span * DISTANCES
-        times = np.append(times[(times - t[0]) * (times - t[-1]) < 0], end)
+        # the last instant is not yet that end, which may be projected
+        times = np.append(times[(times - t[0]) * (times - t[-1]) < 0], at + 0.9 * (end - at))
         if not side * (end - at) > 0:
             return _Side(np.zeros(m), np.full(m, np.inf))
         x = state(times)

@@ -307,7 +307,7 @@ class Stepping:
     def _look_out(self, t, x):
         """Look for the ends of smooth pieces, from the start on."""
         self.tolerance = Tolerance(self.model, x, *(self.tolerances or DEFAULT))
-        self.edges = Edges(self.tolerance, self.length, self.tolerances is None)
+        self.edges = Edges(self.tolerance, self.length, self.tolerances is None, self.projects)
         if self.family is not None:
             branches = self.family.branches(t, x)
             self.switches = Switches(self.family, branches, self.length, self.parts, self.tolerance)

@@ -37,6 +37,7 @@ class RungeKuttaSteps(Stepping):
     def __init__(self, model, method, drift, step, progress):
         self.tableau, self.step = tableau(method), step
         self.every = drift.every if isinstance(drift, Project) else 0
+        self.projects = self.every > 0
         super().__init__(model, method, drift, progress)
 
     def _function(self, model, poles):
