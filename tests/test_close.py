@@ -533,7 +533,7 @@ def test_residuals_of_order_2_are_those_of_the_accelerations():
     values = {"t": t} | parameters | dict(zip(names, jets, strict=True))
     residual = along(model.reduction.mechanism.q, model.reduction.program.residuals["clothoid"], t)
     expected = numbers([residual], values)
-    assert run.residual["clothoid"][:, k] == pytest.approx(expected, abs=1e-9) and abs(expected[0]) > 1e-3
+    assert run.residual["clothoid"][:, k] == pytest.approx(expected, abs=1e-12) and abs(expected[0]) > 1e-3
 
 
 def test_a_closed_run_is_saved_and_loaded(crane_plan, tmp_path):

@@ -15,6 +15,21 @@ from servoctl.spec.integrals import integrals
 from servoctl.spec.references import Jets, function_of, orders_in
 
 
+def _require_order(name, orders, order, valid):
+    """Refuse a name without a residual, or of one whose order is too high; `valid` has all orders by name."""
+    if name not in orders:
+        raise unknown(name, valid, "residual, output or state")
+    if orders[name] > order:
+        raise SpecificationError(
+            f"The residual {name!r} has order {orders[name]}.",
+            "What is fed back is a function of the state (q, γ').",
+            nearest=", ".join(repr(n) for n, order in valid.items() if order <= 1),
+            do="Leave it out.",
+            name=name,
+            order=orders[name],
+        )
+
+
 class Residuals:
     """Residuals of a model's program at the states and parameters of a plant.
 
@@ -63,17 +78,7 @@ class Residuals:
         orders = {name: q.order(e) for name, e in residuals.items()}
         self.order = order = max(2, *orders.values()) if order is None else order
         for name in names or ():
-            if name not in orders:
-                raise unknown(name, valid, "residual, output or state")
-            if orders[name] > order:
-                raise SpecificationError(
-                    f"The residual {name!r} has order {orders[name]}.",
-                    "What is fed back is a function of the state (q, γ').",
-                    nearest=", ".join(repr(n) for n, order in valid.items() if order <= 1),
-                    do="Leave it out.",
-                    name=name,
-                    order=orders[name],
-                )
+            _require_order(name, orders, order, valid)
         self.names = tuple(name for name in orders if orders[name] <= order)
         self.orders = tuple(max(orders[name], 0) for name in self.names)
         chosen = in_symbols_of(plant, model, {name: residuals[name] for name in self.names})

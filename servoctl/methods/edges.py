@@ -16,10 +16,10 @@ from servoctl.tolerances import ENTRY
 from servoctl.values import frozen
 
 PARTS = 4  # of a step, at least, at whose ends arguments are evaluated
-TOUCHES = 0.8  # of an argument's distances from an edge beside the least one: a vertex below this may touch the edge
+MAY_TOUCH = 0.8  # of an argument's distances from an edge beside the least one: a vertex below this may touch the edge
 CLOSE = 1e-8  # of its largest distance so far: an argument that comes so near has met the edge, and may stay there
 JUMPS = 30.0  # times its tolerance, by which a residual changes at an edge only if it jumps
-COARSE = 1e3  # times as much where steps have no tolerances
+FIXED_STEPS = 1e3  # times as much where steps have no tolerances
 OF_TERMS = 1e-3  # of its terms, which a residual does not reach a thousandth of the span away from an edge
 DISTANCES = 0.5 ** np.arange(20, 6, -1)  # of the span: distances from an edge at which residuals are compared
 EXPLAINS = 1e-3  # distance of an argument from its edge that explains why a motion cannot go on
@@ -76,7 +76,7 @@ class Edges:
     """
 
     def __init__(self, tolerance, span, coarse=False, projected=False):
-        self.tolerance, self.span, self.jumps = tolerance, span, JUMPS * (COARSE if coarse else 1.0)
+        self.tolerance, self.span, self.jumps = tolerance, span, JUMPS * (FIXED_STEPS if coarse else 1.0)
         self.projected = projected
         self.met = []  # beyond which residuals are still to be seen: (t, index of the argument, `_Side` before)
         self.start = None  # the first instant and state, where slopes are as usual
@@ -177,7 +177,7 @@ def _turned(t, size, largest):
         bend = (right - left) / (t[2:] - t[:-2])
         vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
     arrives = (here < CLOSE * largest[:, None]) & (before >= CLOSE * largest[:, None])
-    return arrives | (here <= before) & (here < after) & (vertex < TOUCHES * np.minimum(before, after))
+    return arrives | (here <= before) & (here < after) & (vertex < MAY_TOUCH * np.minimum(before, after))
 
 
 def _jump(model, at, why, change):
