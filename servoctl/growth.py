@@ -240,18 +240,7 @@ def internal_dynamics(run: Run, period: float | None = None) -> InternalDynamics
     return judged if end is None else _with_multipliers(model, run, end, period, judged)
 
 
-def growth_bound(run):
-    """A bound of the growth of errors along a run, by the logarithmic norm of its linearisation.
-
-    It is exp max ∫ μ dt over all parts of the run, μ = λ_max(A + Aᵀ)/2 with A = Nᵀ J N in scaled states
-    (Söderlind 2006, eq. (2.5)), where the integral is enlarged by its difference from that by every other instant; inf
-    where A is not finite. One scale of the states, which balances the mean of (J N Nᵀ)², serves the whole run. A large
-    bound says nothing: where A turns, an error may stay small though μ is large.
-    """
-    return _bound(run, _few_tangents(run))
-
-
-def _few_tangents(run):
+def few_tangents(run):
     """Tangents at few instants of a run; None where one is not finite."""
     if run.span[0] == run.span[1]:
         return None
@@ -265,8 +254,14 @@ def _few_tangents(run):
 
 
 @np.errstate(all="ignore")
-def _bound(run, tangents):
-    """As `growth_bound`, from few tangents."""
+def growth_bound(run, tangents):
+    """A bound of the growth of errors along a run, by the logarithmic norm of its linearisation at few instants.
+
+    It is exp max ∫ μ dt over all parts of the run, μ = λ_max(A + Aᵀ)/2 with A = Nᵀ J N in scaled states
+    (Söderlind 2006, eq. (2.5)), where the integral is enlarged by its difference from that by every other instant; inf
+    where A is not finite. One scale of the states, which balances the mean of (J N Nᵀ)², serves the whole run. A large
+    bound says nothing: where A turns, an error may stay small though μ is large.
+    """
     if tangents is None:
         return np.inf
     (t0, t1), N, JN = run.span, tangents.N, tangents.JN
@@ -296,8 +291,8 @@ def _spread(t, x, knots):
 
 def quiet(run):
     """Whether a run's internal dynamics need no warning: by a bound of the growth, or by few propagators."""
-    few = _few_tangents(run)
-    if _bound(run, few) <= UNSTABLE:
+    few = few_tangents(run)
+    if growth_bound(run, few) <= UNSTABLE:
         return True
     count = np.inf if few is None else _frobenius(few.frozen).max() * abs(run.span[1] - run.span[0]) / SHORT
     if not count <= MOST_AT_FIRST:

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 import servoctl as sv
 from servoctl import growth, simulation
 from servoctl.gallery import cars, gallery, mass_on_car, passive_arm, spiral, vtol
-from servoctl.growth import growth_bound
+from servoctl.growth import few_tangents, growth_bound
 
 
 def internal(pair, span, start, **guess):
@@ -392,7 +392,7 @@ def test_a_bound_of_the_growth_settles_what_is_quiet(name, gallery_model, monkey
     real = simulation.internal_dynamics
     monkeypatch.setattr(simulation, "internal_dynamics", lambda *a: calls.append(a) or real(*a))
     run = sv.simulate(model, model.start(**scene.start, guess=scene.guess), scene.t_span)
-    assert not calls and (model.flat or growth_bound(run) < 10)
+    assert not calls and (model.flat or growth_bound(run, few_tangents(run)) < 10)
     if not model.flat:
         assert dict(run.internal) == real(run).facts() and run.internal == run.internal and len(calls) == 1
         assert run.internal["growth"] < 10
@@ -443,7 +443,7 @@ def test_the_bound_is_one_of_the_propagator(seed):
         for span in ((0.0, 2.0), (2.0, 0.0)):
             start = model.start(t=span[0], x=1.0, y=0.5, dx=0.0, dy=0.0)
             run = sv.simulate(model, start, span, t_eval=np.linspace(*span, 41))
-            assert run.internal["growth"] <= 1.05 * growth_bound(run)
+            assert run.internal["growth"] <= 1.05 * growth_bound(run, few_tangents(run))
 
 
 def test_the_verdict_is_computed_when_it_is_read(tmp_path, gallery_model):

@@ -10,7 +10,7 @@ from servoctl.codegen.function import compiled
 from servoctl.dense import steps_of
 from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges
-from servoctl.methods.pieces import RESOLUTION, End, net, residuals, terms_of
+from servoctl.methods.pieces import RESOLUTION, End, least_between, net, residuals, row_of, terms_of
 from servoctl.model.equations import invariant_names
 from servoctl.tolerances import ENTRY
 from servoctl.values import frozen
@@ -172,19 +172,16 @@ class Edges:
 def _turned(t, size, largest):
     """Where sizes (m, N) at times t (N,) become zero, or have a least one that may be, (m, N - 2)."""
     before, here, after = size[:, :-2], size[:, 1:-1], size[:, 2:]
-    with np.errstate(all="ignore"):
-        left, right = (here - before) / (t[1:-1] - t[:-2]), (after - here) / (t[2:] - t[1:-1])
-        bend = (right - left) / (t[2:] - t[:-2])
-        vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
     arrives = (here < CLOSE * largest[:, None]) & (before >= CLOSE * largest[:, None])
-    return arrives | (here <= before) & (here < after) & (vertex < MAY_TOUCH * np.minimum(before, after))
+    least, vertex = least_between(t, size)
+    return arrives | least & (here < after) & (vertex < MAY_TOUCH * np.minimum(before, after))
 
 
 def _jump(model, at, why, change):
     """The error of the residual that changes most, by change (m,), at an edge."""
     worst = int(np.argmax(change))
     name, height = invariant_names(model)[worst][1], float(change[worst])
-    row = next((row.name for row in model.reduction.rows if name.endswith(f"({row.name})")), None)
+    row = row_of(model, name)
     what = f"The residual {name!r}" if row is None else f"The rate {name} of the residual {row!r}"
     what += f" jumps by {height:.3g}" if np.isfinite(height) else " has no value beyond"
     return _stop(what, at, why, row or name, level=name, height=height)

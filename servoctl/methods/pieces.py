@@ -42,6 +42,19 @@ def net(t, distance, least):
     return k, at, j * least % parts[k] == 0
 
 
+def least_between(t, values):
+    """Where values (m, N) at times t (N,) have a least one between two neighbours, and the vertex of a parabola there.
+
+    The vertex is that of the parabola through the three, NaN or infinite where they lie on a line. Both are (m, N - 2).
+    """
+    before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    with np.errstate(all="ignore"):
+        left, right = (here - before) / (t[1:-1] - t[:-2]), (after - here) / (t[2:] - t[1:-1])
+        bend = (right - left) / (t[2:] - t[:-2])
+        vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
+    return (here <= before) & (here <= after) & (bend > 0), vertex
+
+
 class Tolerance:
     """The tolerances of the state along a motion from x0 (n_x,), and of functions of it; atol is a number or (n_x,)."""
 
@@ -87,3 +100,8 @@ def terms_of(model):
         return compiled(e.function("terms", e.state, sizes), "terms")
 
     return model.once("terms", build)
+
+
+def row_of(model, level):
+    """The name of the row of which a level of the invariants is a rate; None for a row itself."""
+    return next((row.name for row in model.reduction.rows if level.endswith(f"({row.name})")), None)

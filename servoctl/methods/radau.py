@@ -208,8 +208,6 @@ class RadauSteps(BulkSteps):
         self.settings = Settings(order, rtol, atol, step is not None, self.every)
         if step is None:
             self.tolerances = rtol, atol
-        else:
-            self.again = self._equal_steps
         super().__init__(model, "RadauIIA", drift, progress)
 
     def _function(self, model, poles):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from servoctl.errors import IntegrationStopped
-from servoctl.methods.pieces import LEAVES, RESOLUTION, End, net, residuals
+from servoctl.methods.pieces import LEAVES, RESOLUTION, End, least_between, net, residuals, row_of
 from servoctl.model.equations import invariant_names
 
 AT_ONCE = 1e-9  # of the span: switches closer than this follow at once
@@ -58,12 +58,8 @@ class Switches:
         """
         if len(t) < 3:
             return None
-        before, here, after = functions[:, :-2], functions[:, 1:-1], functions[:, 2:]
-        with np.errstate(all="ignore"):
-            left, right = (here - before) / (t[1:-1] - t[:-2]), (after - here) / (t[2:] - t[1:-1])
-            bend = (right - left) / (t[2:] - t[:-2])
-            vertex = here - (left + bend * (t[1:-1] - t[:-2])) ** 2 / (4 * bend)
-        low = (here <= before) & (here <= after) & (bend > 0) & (vertex < NEAR_ZERO * np.minimum(before, after))
+        least, vertex = least_between(t, functions)
+        low = least & (vertex < NEAR_ZERO * np.minimum(functions[:, :-2], functions[:, 2:]))
         for j, i in np.argwhere(low.T):
             begin, end = t[j], t[j + 2]
             least, value = self._least(i, begin, end, state)
@@ -149,7 +145,7 @@ class Switches:
             return None
         name, height = names[jumps[0]], float(heights[jumps[0]])
         where = self.texts(end)
-        row = next((row.name for row in model.reduction.rows if name.endswith(f"({row.name})")), None)
+        row = row_of(model, name)
         what = f"{name!r} jumps" if row is None else f"{row!r} has a kink: its rate {name} jumps"
         return IntegrationStopped(
             f"The residual {what} by {height:.3g} at t = {end.t:.7g} s, where {where}.",

@@ -21,17 +21,17 @@ static inline double largest_size(const double *v, const double *w, int64_t n, i
    q' moves it in the step; the terms are taken to grow as the fastest of some do: single coefficients may vanish. */
 static inline double length(double scale, const double *c, const double *w, int64_t n, int64_t level, double log_rtol)
 {
-    const double log_scale = rough_log2(scale), rate = rough_log2(largest_size(c, w, n, level));
+    const double log_scale = rough_log2(scale), rate = level ? 0 : rough_log2(largest_size(c, w, n, 0));
     double shortest = INFINITY;
     for (int64_t m = 0; m < TERMS; m++) {
         const int64_t k = term(m);
         if (k <= level || k < 2) continue;
         const double size = rough_log2(largest_size(c + (k - 1) * n, w, n, level));
         const double growth = (log_scale - size - rough_log2(falling(k, level))) * (1.0 / (double)(k - level));
-        const double h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
-        const double of_way = log_rtol * (1.0 / (double)(LAST - 1)) + (rate - size) * (1.0 / (double)(k - 1));
-        const double longer = level == 0 && of_way > h ? of_way : h;
-        shortest = longer < shortest ? longer : shortest;
+        double h = log_rtol * (1.0 / (double)(LAST - level)) + growth;
+        const double of_way = level ? h : log_rtol * (1.0 / (double)(LAST - 1)) + (rate - size) * (1.0 / (double)(k - 1));
+        h = of_way > h ? of_way : h;
+        shortest = h < shortest ? h : shortest;
     }
     return shortest;
 }
