@@ -68,7 +68,7 @@ def study(name):
     model = sv.derive(*scene.build())
     start = model.start(t=scene.t_span[0], guess=scene.guess, **scene.start)
     methods = ("algebraic", *METHODS) if model.flat else METHODS
-    return sv.tradeoff(model, start, scene.t_span, methods, DRIFTS, seconds=0.5)
+    return sv.tradeoff(model, start, scene.t_span, methods, DRIFTS)
 
 
 def figure(name, trade):

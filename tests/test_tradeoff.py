@@ -33,7 +33,7 @@ def scene(wheel):
 
 @pytest.fixture(scope="module")
 def study(scene):
-    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS, seconds=20.0)
+    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS)
 
 
 def synthetic(errors, seconds, uncertainty=1e-12, **changes):
@@ -42,9 +42,9 @@ def synthetic(errors, seconds, uncertainty=1e-12, **changes):
     columns |= {"method": ["Taylor"] * n, "drift": ["project"] * n, "setting": ["rtol"] * n, "failure": [""] * n}
     columns |= {"model": [""] * n}
     columns |= {"error": errors, "seconds": seconds, "value": [10.0**-k for k in range(n)], **changes}
-    reference = {"method": "a", "verified by": "b", "error": uncertainty, "actuation": 0.0}
+    reference = {"method": "a", "verified by": "b", "error": uncertainty, "actuation": 0.0, "cpu": 1.0}
     machine = {"processor": "p", "cores": 1, "compiler": "cc"}
-    facts = {"t_span": [0.0, 1.0], "models": [""], "reference": reference, "machine": machine}
+    facts = {"t_span": [0.0, 1.0], "models": [""], "cpu": 2.0, "budget": 30.0, "reference": reference, "machine": machine}
     return TradeOff("tradeoff", columns, facts)
 
 
@@ -199,7 +199,7 @@ def test_the_fastest_within_an_error_and_the_best_within_a_time():
 
 def test_a_recommended_time_constant_is_the_measured_one(scene):
     constant = 1 / 7
-    study = sv.tradeoff(*scene, SPAN, {"RK4": [0.01]}, [constant], seconds=20.0)
+    study = sv.tradeoff(*scene, SPAN, {"RK4": [0.01]}, [constant])
     assert study.recommend(error=1.0)["drift"] == constant
 
 
@@ -276,7 +276,7 @@ def test_the_plot_draws_every_number(cost, study):
         ({"methods": {"order": [8]}}, NameUnknown, "No method is named 'order'"),
         ({"methods": {"RK4": "fine"}}, SpecificationError, "step of RK4='fine' was given"),
         ({"methods": {"RK4": []}}, SpecificationError, "step of RK4=[] was given"),
-        ({"seconds": 0.0}, SpecificationError, "seconds=0.0 was given"),
+        ({"budget": 0.0}, SpecificationError, "budget=0.0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),
         ({"drift": [sv.methods.Poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
         ({"t_span": (0.0, 0.0)}, SpecificationError, "two different finite times"),
@@ -332,7 +332,7 @@ def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, 
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("--limit", "0"), ("--error", "-1"), ("--seconds", "nan"), ("--limit", "inf"), ("--error", "x")],
+    [("--budget", "0"), ("--error", "-1"), ("--seconds", "nan"), ("--budget", "inf"), ("--error", "x")],
 )
 def test_the_command_refuses_what_is_no_positive_number_before_it_measures(option, value, capsys):
     with pytest.raises(SystemExit):
