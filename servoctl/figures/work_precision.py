@@ -37,9 +37,10 @@ def draw_tradeoff(study, ax, cost, title, of):
     reached = np.maximum(front[of], floor)
     ax.plot(front[cost], reached, color=FRONT, linewidth=7, zorder=0, solid_capstyle="round")
     ax.scatter(front[cost], reached, s=70, color=FRONT, zorder=0)
+    _name_front(ax, front[LINES[key]].tolist(), front[cost], reached, colours)
     ax.set(xscale="log", yscale="log", xlabel=style.label(cost, "s" if cost == "seconds" else ""), title=title)
     ax.set(ylabel=f"error of the {'motion' if of == 'error' else of}, relative")
-    ax.set_xlim(good[cost].min(initial=1.0) / AXIS_MARGIN, good[cost].max(initial=1e-4) * AXIS_MARGIN)
+    ax.set_xlim(good[cost].min(initial=1.0) / AXIS_MARGIN**2, good[cost].max(initial=1e-4) * AXIS_MARGIN)
     if not len(good):
         ax.text(0.5, 0.5, "every run failed", transform=ax.transAxes, ha="center")
     low = max(floor, 1e-17)
@@ -49,6 +50,17 @@ def draw_tradeoff(study, ax, cost, title, of):
     keys = _keys(colours, [kind for kind in kinds if kind not in colours], dict.fromkeys(drift for *_, drift in lines))
     ax.legend(handles=keys, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
     return ax
+
+
+def _name_front(ax, names, costs, errors, colours):
+    """Write each name once, left of and below its cheapest point, where by definition nothing is drawn."""
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=3, foreground="white")]
+    look = {"textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 9, "path_effects": halo, "zorder": 4}
+    for name in dict.fromkeys(names):
+        first = names.index(name)
+        ax.annotate(name, (costs[first], errors[first]), (-6, -2), color=colours[name], **look)
 
 
 def _lines(study):

@@ -4,6 +4,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -81,7 +82,8 @@ class TradeOff(Study):
     of one evaluation of the rates, or of Newton's step; evaluations of the right-hand side, or of the series, or Newton
     steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive methods (more samples take
     longer), and one at each instant or step for the others; resolved: whether the error of integration exceeds the
-    uncertainty of the converged motions; failure: why there are no numbers.
+    uncertainty of the converged motions, as finer settings than one that does not are left out; failure: why there are
+    no numbers. What a method could not measure, if more than one setting, is one row without a value.
     """
 
     COLUMNS = (
@@ -211,8 +213,10 @@ class TradeOff(Study):
         front = self.pareto()
         shown = evenly(len(front), SHOWN)
         lines = [
-            f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers{self._reasons()}; "
-            f"t = {t0:g} .. {t1:g} s" + ("; interrupted" if self.meta.get("message") else ""),
+            f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers{self._reasons()}"
+            + f"; {self.meta['left out']} finer settings left out" * bool(self.meta["left out"])
+            + f"; t = {t0:g} .. {t1:g} s"
+            + ("; interrupted" if self.meta.get("message") else ""),
             f"  reference: {reference['method']}; {reference['verified by']} agrees to {reference['error']:.1e}, "
             f"actuation to {reference['actuation']:.1e}",
             f"  CPU {reference['cpu']:.2g} s for the reference, {self.meta['cpu']:.2g} of {self.meta['budget']:g} s "
@@ -238,10 +242,10 @@ def tradeoff(
 ) -> TradeOff:
     """Measure error and cost of methods, settings and treatments of drift on one motion, of one model or several.
 
-    The reference is the Taylor method of order 16 at a tolerance of 1e-15, or, where nothing is integrated, Newton's
-    method at each instant. A second method verifies it. Their difference is the uncertainty of the reference; smaller
-    errors are marked as not resolved. The motions of simpler models of the same scene are compared with that of the
-    first one: what they save in time, and cost in error.
+    The reference is the Taylor method of order 16 at a tolerance of 1e-15, Radau IIA of order 13 at 1e-14 where series
+    take longer, or, where nothing is integrated, Newton's method at each instant. A second method verifies it. Their
+    difference is the uncertainty of the reference; smaller errors are marked as not resolved. The motions of simpler
+    models of the same scene are compared with that of the first one: what they save in time, and cost in error.
 
     Main arguments
 
@@ -302,15 +306,12 @@ def tradeoff(
         agreement, began = comparison.agreement, cpu_seconds()
         ladders = [Ladder(name, motions[name], *candidate) for name in motions for candidate in candidates[name]]
         interrupted = _measure(ladders, comparison, budget, bar)
-    rows += [
-        row
-        for name in motions
-        for method in dict.fromkeys(each.method for each in ladders)
-        for row in _rows([each for each in ladders if (each.model, each.method) == (name, method)])
-    ]
+    by_method = groupby(ladders, key=lambda each: (each.model, each.method))
+    rows += [row for _, group in by_method for row in _rows(list(group))]
     columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
     meta = {"t_span": list(span), "budget": budget, "cpu": cpu_seconds() - began, "models": list(models)}
-    meta |= {"outputs": comparison.names, "reference": agreement, "machine": machine()}
+    meta |= {"left out": sum(each.unseen for each in ladders), "outputs": comparison.names}
+    meta |= {"reference": agreement, "machine": machine()}
     meta |= {"measured": time.strftime("%Y-%m-%d"), "message": "interrupted" if interrupted else ""}
     return TradeOff("tradeoff", columns, meta)
 
@@ -359,7 +360,7 @@ def _failure(error):
 
 def _measure(ladders, comparison, budget, bar):
     """Measure settings within a budget [s of CPU], the one that needs least before all others; tells of Ctrl-C."""
-    waiting, end, left = list(ladders), cpu_seconds() + budget, budget
+    waiting, left, end = list(ladders), budget, cpu_seconds() + budget
     try:
         while waiting:
             ladder, left = min(waiting, key=lambda each: each.needed), end - cpu_seconds()
@@ -372,19 +373,22 @@ def _measure(ladders, comparison, budget, bar):
     except KeyboardInterrupt:
         return True
     for ladder in waiting:
-        ladder.leave(f"Budget: {max(left, 0.0):.2g} s were left of {budget:g} s of CPU.")
+        ladder.leave(
+            f"Budget: {ladder.needed:.2g} s of CPU are needed, {max(left, 0.0):.2g} of {budget:g} s were left."
+        )
     return False
 
 
 class Ladder:
     """The settings of a method and a treatment of drift that are still to be measured, and the rows of the others.
 
-    `needed` is the processor time that the next row is expected to need: that of the last one [s].
+    `needed` is the processor time that the next row is expected to need: that of the last one [s]; `unseen` is the
+    number of settings left out, as a coarser one reaches the uncertainty of the reference.
     """
 
     def __init__(self, model, motion, method, treatment, settings):
         self.model, self.motion, self.method, self.treatment = model, motion, method, treatment
-        self.settings, self.needed, self.rows, self.failed = sorted(settings), 0.0, [], []
+        self.settings, self.needed, self.unseen, self.rows, self.failed = sorted(settings), 0.0, 0, [], []
         self.same = {"model": model, "method": method, "drift": _drift_word(treatment), "setting": _kind(method)}
 
     def measure(self, comparison, left, share):
@@ -401,8 +405,8 @@ class Ladder:
         row["resolved"] = row["integration"] >= comparison.agreement["error"]
         self.rows.append(self.same | row | {"value": value, "failure": ""})
         self.needed = cpu_seconds() - began
-        if not row["resolved"]:
-            self.settings = []  # what is finer has no smaller error that could be seen
+        if not row["resolved"]:  # what is finer has no smaller error that could be seen
+            self.unseen, self.settings = len(self.settings), []
 
     def _failed(self, error, left):
         needed = error.details.get("needed")  # only of runs that took too long
