@@ -206,7 +206,7 @@ def test_a_stiff_model_is_measured_by_an_implicit_method_too():
         return sv.derive(mechanism, sv.Program({"x": x - path}, by="actuators"))
 
     models = {"stiff": coupled(), "soft": coupled(False)}
-    study = sv.tradeoff(models, models["stiff"].start(), (0.0, 1.0))
+    study = sv.tradeoff(models, models["stiff"].start(), (0.0, 1.0), budget=5.0)
     assert list(dict.fromkeys(study.where(model="soft")["method"])) == ["Taylor", "RadauIIA"]
     stiff = study.where(model="stiff").take(np.flatnonzero(np.isfinite(study.where(model="stiff")["error"])))
     implicit, series = stiff.where(method="RadauIIA", value=1e-5), stiff.where(method="Taylor", value=1e-5)

@@ -20,8 +20,8 @@ from servoctl.verification import verify
 INSTANTS = 51  # samples of adaptive methods while they are timed
 COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, and where in its interval each lies
 EXACT = (  # what a motion converges to, tried in this order: two that end, the implicit ones where it is stiff
-    *(Taylor(16, rtol=1e-15, atol=1e-15), Adaptive("DOP853", 3e-14, 1e-15), RadauIIA(13, rtol=1e-14, atol=1e-15)),
-    *(Taylor(12, rtol=1e-14, atol=1e-14), RadauIIA(9, rtol=1e-13, atol=1e-14)),
+    *(Taylor(16, rtol=1e-15, atol=1e-15), Adaptive("DOP853", 3e-14, 1e-15), Adaptive("LSODA", 1e-13, 1e-15)),
+    *(RadauIIA(13, rtol=1e-14, atol=1e-15), RadauIIA(9, rtol=1e-13, atol=1e-14), Taylor(12, rtol=1e-14, atol=1e-14)),
 )
 FIRST = 0.3  # s of CPU after which a run for the reference waits until the others have been tried
 
@@ -50,26 +50,29 @@ class Converged:
         self.cpu = cpu_seconds() - began
 
     def _run(self, method, times, progress=False):
-        drift = None if isinstance(method, Algebraic) else Project()
+        drift = None if Project in method.refused else Project()
         run = simulated(self.model, self.start, self.span, method, drift=drift, t_eval=times, progress=progress)
         return whole_run(run)
 
     def _find_two(self, found, bar):
-        """Add runs by method until there are two; of those that take long the one goes on that needs least."""
-        dear = not isinstance(default_method(self.model, None), Taylor)  # series are tried last
-        waiting, failures = dict.fromkeys(sorted(EXACT, key=lambda each: dear and isinstance(each, Taylor)), 0.0), []
+        """Add runs by method until there are two; what takes long waits for what is expected to take less."""
+        series_pay = isinstance(default_method(self.model, None), Taylor)
+        untried = sorted(EXACT, key=lambda each: isinstance(each, Taylor) and not series_pay)
+        waiting, dearest, failures = {}, 0.0, []
         while len(found) < 2:
-            if not waiting:
+            if not untried and not waiting or len(failures) > 1 and not found:  # two methods say where it ends
                 raise failures[0]
-            method = min(waiting, key=waiting.get)
-            needed = waiting.pop(method)
+            known = min(waiting, key=waiting.get, default=None)
+            method = known if not untried or known and waiting[known] < dearest else untried.pop(0)
+            limit, began = max(FIRST, 2 * waiting.pop(method, dearest)), cpu_seconds()
             try:
-                found[method] = self._run(method, self.times, Deadline(max(FIRST, 2 * needed), self.span, bar))
+                found[method] = self._run(method, self.times, Deadline(limit, self.span, bar))
             except ServoError as error:
-                if isinstance(error, LimitExceeded) and "needed" in error.details:
+                if "needed" in error.details:
                     waiting[method] = error.details["needed"]
                 else:
                     failures.append(error)
+            dearest = max(dearest, cpu_seconds() - began)
 
     def at(self, times):
         """The run with samples at these times (N,) [s]."""
