@@ -54,13 +54,10 @@ def draw_tradeoff(study, ax, cost, title, of):
 
 def _name_front(ax, names, costs, errors, colours):
     """Write each name once, left of and below its cheapest point, where by definition nothing is drawn."""
-    from matplotlib.patheffects import withStroke
-
-    halo = [withStroke(linewidth=3, foreground="white")]
-    look = {"textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 9, "path_effects": halo, "zorder": 4}
     for name in dict.fromkeys(names):
-        first = names.index(name)
-        ax.annotate(name, (costs[first], errors[first]), (-6, -2), color=colours[name], **look)
+        point = costs[names.index(name)], errors[names.index(name)]
+        where = {"textcoords": "offset points", "ha": "right", "va": "top"}
+        ax.annotate(name, point, (-6, -2), color=colours[name], fontsize=9, **where)
 
 
 def _lines(study):

@@ -45,28 +45,29 @@ class Converged:
         self.forces = [name for name, of in signal_groups(model.reduction).items() if of in ("actuation", "reaction")]
         found = {Algebraic(): self._run(Algebraic(), self.times, Deadline(np.inf, span, bar))} if model.flat else {}
         self._find_two(found, bar)
-        (self.method, run), (self.checked_by, self.check) = sorted(found.items(), key=lambda pair: _rank(pair[0]))
-        self._runs = {self.times.tobytes(): run}
+        self.method, self.checked_by = sorted(found, key=(Algebraic(), *EXACT).index)
+        self.check, self._runs = found[self.checked_by], {self.times.tobytes(): found[self.method]}
         self.cpu = cpu_seconds() - began
 
     def _run(self, method, times, progress=False):
-        drift = None if Project in method.refused else Project()
-        run = simulated(self.model, self.start, self.span, method, drift=drift, t_eval=times, progress=progress)
-        return whole_run(run)
+        options = {"drift": None if Project in method.refused else Project(), "t_eval": times, "progress": progress}
+        return whole_run(simulated(self.model, self.start, self.span, method, **options))
 
     def _find_two(self, found, bar):
         """Add runs by method until there are two; what takes long waits for what is expected to take less."""
         series_pay = isinstance(default_method(self.model, None), Taylor)
-        untried = sorted(EXACT, key=lambda each: isinstance(each, Taylor) and not series_pay)
-        waiting, dearest, failures = {}, 0.0, []
+        waiting = dict.fromkeys(sorted(EXACT, key=lambda each: isinstance(each, Taylor) and not series_pay), 0.0)
+        dearest, failures = 0.0, []
         while len(found) < 2:
-            if not untried and not waiting or len(failures) > 1 and not found:  # two methods say where it ends
+            if not waiting or len(failures) > 1 and not found:  # two methods say where it ends
                 raise failures[0]
-            known = min(waiting, key=waiting.get, default=None)
-            method = known if not untried or known and waiting[known] < dearest else untried.pop(0)
-            limit, began = max(FIRST, 2 * waiting.pop(method, dearest)), cpu_seconds()
+            expected = {method: needed or dearest for method, needed in waiting.items()}
+            method, began = min(expected, key=expected.get), cpu_seconds()
+            del waiting[method]
             try:
-                found[method] = self._run(method, self.times, Deadline(limit, self.span, bar))
+                found[method] = self._run(
+                    method, self.times, Deadline(max(FIRST, 2 * expected[method]), self.span, bar)
+                )
             except ServoError as error:
                 if "needed" in error.details:
                     waiting[method] = error.details["needed"]
@@ -82,15 +83,9 @@ class Converged:
         return self._runs[key]
 
 
-def _rank(method):
-    """Which of two methods is the reference, and which the check."""
-    return EXACT.index(method) if method in EXACT else -1
-
-
 def cpu_seconds():
     """Processor time of this process and of the compilers that it has called [s]."""
-    times = os.times()
-    return time.process_time() + times.children_user + times.children_system
+    return time.process_time() + sum(os.times()[2:4])
 
 
 class Deadline:
@@ -104,17 +99,14 @@ class Deadline:
 
     def __call__(self, t):
         """Raise LimitExceeded when the time is over."""
-        now = cpu_seconds()
-        self.since = self.since or now
+        self.since = self.since or cpu_seconds()
+        spent, (t0, t1) = cpu_seconds() - self.since, self.span
         if self.bar is not None:
             self.bar.update(0)  # the time that it shows
-        if now - self.since > self.seconds:
-            t0, t1 = self.span
-            needed = (now - self.since) * (t1 - t0) / (t - t0) if t != t0 else np.inf
+        if spent > self.seconds:
+            needed = spent * (t1 - t0) / (t - t0) if t != t0 else np.inf
             raise LimitExceeded(
-                f"More than {self.seconds:.2g} s of CPU: ended at t = {t:.4g} s of {t1:g} s.",
-                needed=needed,
-                t=t,
+                f"More than {self.seconds:.2g} s of CPU: ended at t = {t:.4g} s of {t1:g} s", needed=needed, t=t
             )
 
 

@@ -188,13 +188,7 @@ class TradeOff(Study):
 
         return draw_tradeoff(self, ax, named(cost, COSTS, "cost"), text("title", title), named(of, ERRORS, "error"))
 
-    def _tables(self):
-        return Shown._tables(self)
-
-    def _reasons(self):
-        """Why rows have no numbers, by count."""
-        kinds = Counter(text.partition(":")[0] for text in self["failure"].tolist() if text)
-        return f" ({', '.join(f'{count} {kind[:30]}' for kind, count in kinds.most_common(3))})" * bool(kinds)
+    _tables = Shown._tables
 
     def _advice(self, front):
         """One sentence: the middle of the front, and below which error a single method is left."""
@@ -203,17 +197,19 @@ class TradeOff(Study):
         row, good = front.rows()[len(front) // 2], self.take(np.flatnonzero(np.isfinite(self["error"])))
         kind = "model" if len(self.meta["models"]) > 1 else "method"
         best = sorted((good.where(**{kind: name})._errors("error").min(), name) for name in set(good[kind].tolist()))
-        said = f"{_in_words(row)}: {row['error']:.0e} for {1e3 * row['seconds']:.2g} ms"
         alone = len(best) > 1 and f"{best[1][0]:.0e}" != f"{best[0][0]:.0e}"
-        return f"{said}; below {best[1][0]:.0e} only {best[0][1]}" if alone else said
+        only = f"; below {best[1][0]:.0e} only {best[0][1]}" if alone else ""
+        return f"{_in_words(row)}: {row['error']:.0e} for {1e3 * row['seconds']:.2g} ms{only}"
 
     def __repr__(self):
         t0, t1 = self.meta["t_span"]
         reference, where = self.meta["reference"], self.meta["machine"]
         front = self.pareto()
         shown = evenly(len(front), SHOWN)
+        kinds = Counter(why.partition(":")[0] for why in self["failure"].tolist() if why)
         lines = [
-            f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers{self._reasons()}"
+            f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers"
+            + f" ({', '.join(f'{count} {kind}' for kind, count in kinds.most_common())})" * bool(kinds)
             + f"; {self.meta['left out']} finer settings left out" * bool(self.meta["left out"])
             + f"; t = {t0:g} .. {t1:g} s"
             + ("; interrupted" if self.meta.get("message") else ""),
@@ -305,14 +301,13 @@ def tradeoff(
         comparison = Comparison(motions, outputs)
         agreement, began = comparison.agreement, cpu_seconds()
         ladders = [Ladder(name, motions[name], *candidate) for name in motions for candidate in candidates[name]]
-        interrupted = _measure(ladders, comparison, budget, bar)
+        message = _measure(ladders, comparison, budget, bar)
     by_method = groupby(ladders, key=lambda each: (each.model, each.method))
     rows += [row for _, group in by_method for row in _rows(list(group))]
     columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
     meta = {"t_span": list(span), "budget": budget, "cpu": cpu_seconds() - began, "models": list(models)}
-    meta |= {"left out": sum(each.unseen for each in ladders), "outputs": comparison.names}
-    meta |= {"reference": agreement, "machine": machine()}
-    meta |= {"measured": time.strftime("%Y-%m-%d"), "message": "interrupted" if interrupted else ""}
+    meta |= {"left out": sum(each.unseen for each in ladders), "outputs": comparison.names, "reference": agreement}
+    meta |= {"machine": machine(), "measured": time.strftime("%Y-%m-%d"), "message": message}
     return TradeOff("tradeoff", columns, meta)
 
 
@@ -372,12 +367,13 @@ def _measure(ladders, comparison, budget, bar):
             bar.update(count - len(ladder.settings))
             waiting = [each for each in waiting if each.settings]
     except KeyboardInterrupt:
-        return True
+        return "interrupted"
     for ladder in waiting:
         ladder.leave(
-            f"Budget: {ladder.needed:.2g} s of CPU are needed, {max(left, 0.0):.2g} of {budget:g} s were left."
+            f"Budget: {ladder.needed:.2g} s of CPU are needed, {max(left, 0):.2g} of {budget:g} s were left.",
+            len(ladder.settings),
         )
-    return False
+    return ""
 
 
 class Ladder:
@@ -396,49 +392,37 @@ class Ladder:
         """Measure the coarsest setting, by runs of an equal share of the time that is left, or twice what is needed."""
         value, began, limit = self.settings[-1], cpu_seconds(), min(left, max(share, 2 * self.needed))
         try:
-            method = method_at(self.method, value)
-            row = _errors_and_cost(comparison, self.motion, method, self.treatment, value, limit)
+            row = _errors_and_cost(comparison, self.motion, method_at(self.method, value), self.treatment, value, limit)
         except ServoError as error:
-            self.needed = cpu_seconds() - began
-            self._failed(error, left - self.needed)
+            self.needed, needed = cpu_seconds() - began, error.details.get("needed")  # by runs that took too long
+            if needed is not None and needed < left - self.needed:
+                self.needed = needed  # the same setting again
+            else:  # finer settings are invalid, too, or take longer
+                finer = isinstance(error, SpecificationError) or needed is not None and self.rows
+                self.leave(_failure(error), len(self.settings) if finer else 1)
             return
-        self.settings.pop()
         row["resolved"] = row["integration"] >= comparison.agreement["error"]
-        self.rows.append(self.same | row | {"value": value, "failure": ""})
+        self.rows.append(self.same | row | {"value": self.settings.pop(), "failure": ""})
         self.needed = cpu_seconds() - began
         if not row["resolved"]:  # what is finer has no smaller error that could be seen
             self.unseen, self.settings = len(self.settings), []
 
-    def _failed(self, error, left):
-        needed = error.details.get("needed")  # only of runs that took too long
-        if needed is not None and needed < left:
-            self.needed = needed  # the same setting again
-        elif isinstance(error, SpecificationError) or needed is not None and self.rows:
-            self.leave(_failure(error))  # finer settings are invalid, or longer
-        else:
-            self._add(_failure(error))
-
-    def leave(self, reason):
-        """The reason for all settings that are left."""
-        self._add(reason + f" Likewise {len(self.settings) - 1} finer ones." * (len(self.settings) > 1))
-        self.settings = []
-
-    def _add(self, failure):
-        self.failed.append(self.same | {"value": self.settings.pop(), "failure": failure})
+    def leave(self, reason, count):
+        """The reason for so many of the settings that are left, the coarsest first."""
+        reason += f" Likewise {count - 1} finer ones." * (count > 1)
+        self.failed.append(self.same | {"value": self.settings[-1], "failure": reason})
+        del self.settings[-count:]
 
 
 def _rows(ladders):
     """The rows of a method: those with numbers, and one for all that failed."""
-    for ladder in ladders:
-        yield from ladder.rows
     failed = [row for ladder in ladders for row in ladder.failed]
-    if len(failed) < 2:
-        yield from failed
-        return
-    first, *others = failed
-    drift = first["drift"] if len({row["drift"] for row in failed}) == 1 else ""
-    also = (f"{row['drift']} {row['value']:g}: {row['failure'].partition(':')[0]}" for row in others)
-    yield first | {"drift": drift, "value": np.nan, "failure": f"{first['failure']} Also {'; '.join(also)}."}
+    if len(failed) > 1:
+        first, *others = failed
+        drift = first["drift"] if len({row["drift"] for row in failed}) == 1 else ""
+        also = (f"{row['drift']} {row['value']:g}: {row['failure'].partition(':')[0]}" for row in others)
+        failed = [first | {"drift": drift, "value": np.nan, "failure": f"{first['failure']} Also {'; '.join(also)}."}]
+    return [*(row for ladder in ladders for row in ladder.rows), *failed]
 
 
 def _errors_and_cost(comparison, motion, method, treatment, value, limit):
@@ -496,13 +480,12 @@ def _candidates(model, methods, drift, span, models):
     if methods is None:
         all_methods = [name for name in MEASURED if name != "algebraic"] if models == 1 else OF_MODELS
         methods = ["algebraic"] if model.flat else all_methods
-    asked = drift is not None
-    if not asked:
-        drift = (None, "project", length / TIME_CONSTANT) if models == 1 else ("project",)
+    default = (None, "project", length / TIME_CONSTANT) if models == 1 else ("project",)
+    wanted = default if drift is None else drift
     names = list(methods) if isinstance(methods, (list, tuple, dict)) else [methods]
     for method in names:
         named(method, METHODS, "method")
-    treatments = [as_drift(value) for value in (drift if isinstance(drift, (list, tuple)) else [drift])]
+    treatments = [as_drift(value) for value in (wanted if isinstance(wanted, (list, tuple)) else [wanted])]
     if any(isinstance(value, Poles) and not isinstance(value.values, float) for value in treatments):
         raise SpecificationError(
             "Poles by row were given.",
@@ -514,7 +497,7 @@ def _candidates(model, methods, drift, span, models):
     settings = {name: _settings(name, given[name], length) for name in names}
     pairs = [(m, None) for m in names if m == "algebraic"]
     integrated = [(m, d) for m in names for d in treatments if m != "algebraic"]
-    pairs += [(m, d) for m, d in integrated if asked or type(d) not in as_method(m).refused]
+    pairs += [(m, d) for m, d in integrated if drift is not None or type(d) not in as_method(m).refused]
     if not pairs:
         raise SpecificationError(
             f"methods={methods!r} and drift={drift!r} were given.",
