@@ -61,7 +61,7 @@ class Converged:
         while len(found) < 2:
             if not waiting or len(failures) > 1 and not found:  # two methods say where it ends
                 raise failures[0]
-            expected = {method: needed or dearest for method, needed in waiting.items()}
+            expected = {method: needed or 2 * dearest for method, needed in waiting.items()}  # it is made, then runs
             method, began = min(expected, key=expected.get), cpu_seconds()
             del waiting[method]
             try:
