@@ -208,11 +208,10 @@ class TradeOff(Study):
         shown = evenly(len(front), SHOWN)
         kinds = Counter(why.partition(":")[0] for why in self["failure"].tolist() if why)
         lines = [
-            f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers"
+            f"Trade-off{', interrupted' * bool(self.meta.get('message'))}: t = {t0:g} .. {t1:g} s, {len(self)} rows, "
+            f"{int(np.isnan(self['error']).sum())} empty"
             + f" ({', '.join(f'{count} {kind}' for kind, count in kinds.most_common())})" * bool(kinds)
-            + f"; {self.meta['left out']} finer settings left out" * bool(self.meta["left out"])
-            + f"; t = {t0:g} .. {t1:g} s"
-            + ("; interrupted" if self.meta.get("message") else ""),
+            + f"; {self.meta['left out']} finer left out" * bool(self.meta["left out"]),
             f"  reference: {reference['method']}; {reference['verified by']} agrees to {reference['error']:.1e}, "
             f"actuation to {reference['actuation']:.1e}",
             f"  CPU {reference['cpu']:.2g} s for the reference, {self.meta['cpu']:.2g} of {self.meta['budget']:g} s "
