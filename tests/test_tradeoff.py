@@ -163,7 +163,7 @@ def test_a_budget_that_suffices_for_nothing_says_so(scene):
     study = sv.tradeoff(*scene, SPAN, {"RK4": STEPS, "DOP853": TOLERANCES}, [None], budget=1e-9)
     assert study["method"].tolist() == ["RK4", "DOP853"] and np.isnan(study["error"]).all()
     for failure in study["failure"]:
-        assert failure.startswith("Budget: ") and "of 1e-09 s were left. Likewise 2 finer ones." in failure
+        assert failure.startswith("Budget: ") and "of 1e-09 s were left. Finer ones likewise: 2." in failure
     assert "(2 Budget)" in repr(study) and f"CPU {study.meta['reference']['cpu']:.2g} s for the reference" in repr(study)
     with refused(LimitExceeded, "see the column failure"):
         study.recommend(error=1e-3)

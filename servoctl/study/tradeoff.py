@@ -199,7 +199,7 @@ class TradeOff(Study):
         best = sorted((good.where(**{kind: name})._errors("error").min(), name) for name in set(good[kind].tolist()))
         alone = len(best) > 1 and f"{best[1][0]:.0e}" != f"{best[0][0]:.0e}"
         only = f"; below {best[1][0]:.0e} only {best[0][1]}" if alone else ""
-        return f"{_in_words(row)}: {row['error']:.0e} for {1e3 * row['seconds']:.2g} ms{only}"
+        return f"{_in_words(row)}: {max(row['error'], self.uncertainty):.0e} for {1e3 * row['seconds']:.2g} ms{only}"
 
     def __repr__(self):
         t0, t1 = self.meta["t_span"]
@@ -408,7 +408,7 @@ class Ladder:
 
     def leave(self, reason, count):
         """The reason for so many of the settings that are left, the coarsest first."""
-        reason += f" Likewise {count - 1} finer ones." * (count > 1)
+        reason += f" Finer ones likewise: {count - 1}." * (count > 1)
         self.failed.append(self.same | {"value": self.settings[-1], "failure": reason})
         del self.settings[-count:]
 
