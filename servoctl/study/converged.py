@@ -54,14 +54,21 @@ class Converged:
         return whole_run(simulated(self.model, self.start, self.span, method, **options))
 
     def _find_two(self, found, bar):
-        """Add runs by method until there are two; what takes long waits for what is expected to take less."""
+        """Add runs by method until there are two; what takes long waits for what is expected to take less.
+
+        An untried method is expected to take twice as long as the longest attempt; series and implicit steps, which must
+        be made first, as many times as there are states, as their Jacobian has so many columns.
+        """
         series_pay = isinstance(default_method(self.model, None), Taylor)
         waiting = dict.fromkeys(sorted(EXACT, key=lambda each: isinstance(each, Taylor) and not series_pay), 0.0)
         dearest, failures = 0.0, []
         while len(found) < 2:
             if not waiting or len(failures) > 1 and not found:  # two methods say where it ends
                 raise failures[0]
-            expected = {method: needed or 2 * dearest for method, needed in waiting.items()}  # it is made, then runs
+            untried = {
+                each: dearest * (2 if isinstance(each, Adaptive) else len(self.model.state_names)) for each in waiting
+            }
+            expected = {method: needed or untried[method] for method, needed in waiting.items()}
             method, began = min(expected, key=expected.get), cpu_seconds()
             del waiting[method]
             try:
