@@ -56,8 +56,8 @@ class Converged:
     def _find_two(self, found, bar):
         """Add runs by method until there are two; what takes long waits for what is expected to take less.
 
-        An untried method is expected to take twice as long as the longest attempt; series and implicit steps, which must
-        be made first, as many times as there are states, as their Jacobian has so many columns.
+        An untried method is expected to take twice as long as the longest attempt; series and implicit steps, which are
+        made first, as many times as there are states, as their Jacobian has so many columns.
         """
         series_pay = isinstance(default_method(self.model, None), Taylor)
         waiting = dict.fromkeys(sorted(EXACT, key=lambda each: isinstance(each, Taylor) and not series_pay), 0.0)
@@ -65,10 +65,10 @@ class Converged:
         while len(found) < 2:
             if not waiting or len(failures) > 1 and not found:  # two methods say where it ends
                 raise failures[0]
-            untried = {
-                each: dearest * (2 if isinstance(each, Adaptive) else len(self.model.state_names)) for each in waiting
+            expected = {
+                each: needed or dearest * (2 if isinstance(each, Adaptive) else len(self.model.state_names))
+                for each, needed in waiting.items()
             }
-            expected = {method: needed or untried[method] for method, needed in waiting.items()}
             method, began = min(expected, key=expected.get), cpu_seconds()
             del waiting[method]
             try:
