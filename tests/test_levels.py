@@ -136,7 +136,7 @@ TOLERANCES = (1e-3, 1e-6, 1e-9)
 
 @pytest.fixture(scope="module")
 def three():
-    return pendula("plain", "linear", methods={"Taylor": TOLERANCES}, seconds=3.0)
+    return pendula("plain", "linear", methods={"Taylor": TOLERANCES})
 
 
 def instants(t1, count=2001):
@@ -206,7 +206,7 @@ def test_a_stiff_model_is_measured_by_an_implicit_method_too():
         return sv.derive(mechanism, sv.Program({"x": x - path}, by="actuators"))
 
     models = {"stiff": coupled(), "soft": coupled(False)}
-    study = sv.tradeoff(models, models["stiff"].start(), (0.0, 1.0), seconds=3.0)
+    study = sv.tradeoff(models, models["stiff"].start(), (0.0, 1.0), budget=5.0)
     assert list(dict.fromkeys(study.where(model="soft")["method"])) == ["Taylor", "RadauIIA"]
     stiff = study.where(model="stiff").take(np.flatnonzero(np.isfinite(study.where(model="stiff")["error"])))
     implicit, series = stiff.where(method="RadauIIA", value=1e-5), stiff.where(method="Taylor", value=1e-5)
@@ -258,7 +258,7 @@ def test_ideal_programs_compare_reactions():
 
 
 def test_what_no_row_reaches_names_the_nearest_model():
-    study = ropes(seconds=3.0)
+    study = ropes()
     assert study.recommend(error=0.1).row["model"] in ("rigid", "elastic")
     with refused(LimitExceeded, limit=1e-20) as caught:
         study.recommend(error=1e-20)

@@ -15,6 +15,7 @@ from servoctl.methods.accuracy import motion_error
 from servoctl.methods.choice import METHODS as ALL_METHODS
 from servoctl.methods.choice import as_method
 from servoctl.shell.main import main
+from servoctl.study import tradeoff as module
 from servoctl.study.load import load
 from servoctl.study.table import Study
 from servoctl.study.tradeoff import TOLERANCES as DEFAULTS
@@ -33,7 +34,7 @@ def scene(wheel):
 
 @pytest.fixture(scope="module")
 def study(scene):
-    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS, seconds=20.0)
+    return sv.tradeoff(*scene, SPAN, METHODS, DRIFTS)
 
 
 def synthetic(errors, seconds, uncertainty=1e-12, **changes):
@@ -42,9 +43,9 @@ def synthetic(errors, seconds, uncertainty=1e-12, **changes):
     columns |= {"method": ["Taylor"] * n, "drift": ["project"] * n, "setting": ["rtol"] * n, "failure": [""] * n}
     columns |= {"model": [""] * n}
     columns |= {"error": errors, "seconds": seconds, "value": [10.0**-k for k in range(n)], **changes}
-    reference = {"method": "a", "verified by": "b", "error": uncertainty, "actuation": 0.0}
+    reference = {"method": "a", "verified by": "b", "error": uncertainty, "actuation": 0.0, "cpu": 1.0}
     machine = {"processor": "p", "cores": 1, "compiler": "cc"}
-    facts = {"t_span": [0.0, 1.0], "models": [""], "reference": reference, "machine": machine}
+    facts = {"t_span": [0.0, 1.0], "models": [""], "cpu": 2.0, "budget": 30.0, "left out": 0, "reference": reference, "machine": machine}
     return TradeOff("tradeoff", columns, facts)
 
 
@@ -123,19 +124,73 @@ def test_the_machine_is_recorded(study):
     assert set(machine["versions"]) == {"servoctl", "python", "casadi", "numpy", "scipy"}
 
 
-def test_slow_candidates_are_skipped_and_say_so(scene, monkeypatch):
-    monkeypatch.setattr("servoctl.study.tradeoff.FEW", 0)
-    slow = sv.tradeoff(*scene, SPAN, {"RK4": STEPS, "DOP853": TOLERANCES}, [None], seconds=1e-9)
-    assert len(slow) == 6
-    fixed, adaptive = slow.where(method="RK4").rows(), slow.where(method="DOP853").rows()
-    assert fixed[0]["failure"] == "" and all(r["failure"].startswith("skipped: step = 0.1 took") for r in fixed[1:])
-    assert "More than 1e-09 s: ended at t =" in adaptive[0]["failure"]
-    assert all("skipped: rtol = 0.001 took more than" in row["failure"] for row in adaptive[1:])
+COSTS = {("RK4", 0.1): 0.01, ("RK4", 0.025): 0.04, ("RK4", 0.005): 2.0, ("Taylor", 1e-3): 0.1, ("Taylor", 1e-6): 0.3,
+         ("Taylor", 1e-9): 0.5, ("DOP853", 1e-3): np.inf, ("DOP853", 1e-6): 0.2, ("DOP853", 1e-9): 90.0}  # fmt: skip
 
 
-def test_what_gets_lost_in_its_first_steps_skips_no_finer_setting(scene):
-    lost = sv.tradeoff(*scene, SPAN, {"DOP853": TOLERANCES}, [None], seconds=1e-9)
-    assert len(lost) == len(TOLERANCES) and all("ended at t =" in failure for failure in lost["failure"])
+@pytest.fixture
+def measured(monkeypatch):
+    """Settings in the order in which they were begun, on a clock that their costs [s] drive; what costs inf is lost."""
+    clock, begun = [0.0], []
+
+    def run(comparison, motion, method, treatment, value, limit):
+        needed = COSTS[str(method), value]
+        begun.append((str(method), value))
+        clock[0] += min(needed, limit)
+        if needed > limit:
+            raise LimitExceeded(f"More than {limit:.2g} s of CPU: ended at t = 0.5 s of 1 s", needed=needed)
+        return dict.fromkeys(("error", "integration", "actuation"), value) | {"seconds": needed, "evaluations": 1}
+
+    monkeypatch.setattr(module, "cpu_seconds", lambda: clock[0])
+    monkeypatch.setattr(module, "_errors_and_cost", run)
+    return begun
+
+
+def test_what_needs_least_is_measured_first_and_what_does_not_fit_says_so(scene, measured):
+    methods = {"RK4": STEPS, "Taylor": TOLERANCES, "DOP853": TOLERANCES}
+    study = sv.tradeoff(*scene, SPAN, methods, [None], budget=12.0)
+    assert measured[:3] == [("RK4", 0.1), ("DOP853", 1e-3), ("Taylor", 1e-3)], "every method before any finer setting"
+    assert measured[3:6] == [("RK4", 0.025), ("RK4", 0.005), ("Taylor", 1e-6)]
+    assert study.meta["cpu"] <= 12.0 and len(study) == 8
+    assert study.where(method="Taylor")["value"].tolist() == list(TOLERANCES)
+    assert study.where(method="RK4")["value"].tolist() == list(STEPS), "what was cut has a longer run later"
+    found, failed = study.where(method="DOP853").rows()
+    assert found["value"] == 1e-6, "a coarse setting that gets lost says nothing about finer ones"
+    assert "LimitExceeded: More than" in failed["failure"] and "Also none 1e-09" in failed["failure"]
+
+
+def test_a_budget_that_suffices_for_nothing_says_so(scene):
+    study = sv.tradeoff(*scene, SPAN, {"RK4": STEPS, "DOP853": TOLERANCES}, [None], budget=1e-9)
+    assert study["method"].tolist() == ["RK4", "DOP853"] and np.isnan(study["error"]).all()
+    for failure in study["failure"]:
+        assert failure.startswith("Budget: ") and "of 1e-09 s were left. Finer ones likewise: 2." in failure
+    assert "(2 Budget)" in repr(study) and f"CPU {study.meta['reference']['cpu']:.2g} s for the reference" in repr(study)
+    with refused(LimitExceeded, "see the column failure"):
+        study.recommend(error=1e-3)
+
+
+def test_a_method_that_cannot_run_is_one_row_with_its_reasons(scene):
+    study = sv.tradeoff(*scene, SPAN, {"DOP853": [1e-3, 1e-16], "LSODA": 1e-3}, ["project", 0.05])
+    assert study.where(method="DOP853")["value"].tolist()[:2] == [1e-3, 1e-3]
+    *_, failed = study.where(method="DOP853").rows()
+    assert len(study.where(method="DOP853")) == 3 and failed["drift"] == "" and np.isnan(failed["value"])
+    assert "rtol=1e-16" in failed["failure"] and "Also 0.05 1e-16: SpecificationError" in failed["failure"]
+    assert "was given with method" in study.where(method="LSODA", drift="project")["failure"][0]
+
+
+def test_defaults_leave_out_what_does_not_go_together(scene):
+    study = sv.tradeoff(*scene, SPAN, {"Taylor": 1e-3, "LSODA": 1e-3})
+    assert list(zip(study["method"].tolist(), study["drift"].tolist(), strict=True)) == [
+        ("Taylor", "none"), ("Taylor", "project"), ("LSODA", "none"), ("LSODA", "0.02"),
+    ]  # fmt: skip
+
+
+def test_one_sentence_says_what_to_take():
+    several = synthetic([1e-2, 1e-6, 1e-9, 1e-5], [1e-3, 2e-3, 5e-3, 1.0], method=["Taylor"] * 3 + ["RK4"])
+    assert "  Taylor at rtol 0.1, projected: 1e-06 for 2 ms; below 1e-05 only Taylor. Fastest for each error" in repr(several)
+    alike = synthetic([1e-2, 1.01e-9, 1e-9], [1e-3, 2e-3, 5e-3], method=["RK4", "RK8", "Taylor"])
+    assert "below" not in repr(alike)
+    assert "no row has numbers" in repr(synthetic([np.nan], [np.nan]))
 
 
 def test_a_program_without_free_values_is_solved(gallery_model):
@@ -199,7 +254,7 @@ def test_the_fastest_within_an_error_and_the_best_within_a_time():
 
 def test_a_recommended_time_constant_is_the_measured_one(scene):
     constant = 1 / 7
-    study = sv.tradeoff(*scene, SPAN, {"RK4": [0.01]}, [constant], seconds=20.0)
+    study = sv.tradeoff(*scene, SPAN, {"RK4": [0.01]}, [constant])
     assert study.recommend(error=1.0)["drift"] == constant
 
 
@@ -276,7 +331,7 @@ def test_the_plot_draws_every_number(cost, study):
         ({"methods": {"order": [8]}}, NameUnknown, "No method is named 'order'"),
         ({"methods": {"RK4": "fine"}}, SpecificationError, "step of RK4='fine' was given"),
         ({"methods": {"RK4": []}}, SpecificationError, "step of RK4=[] was given"),
-        ({"seconds": 0.0}, SpecificationError, "seconds=0.0 was given"),
+        ({"budget": 0.0}, SpecificationError, "budget=0.0 was given"),
         ({"drift": ["often"]}, NameUnknown, "drift treatment"),
         ({"drift": [sv.methods.Poles({"x_c": [-1.0]})]}, SpecificationError, "time constant"),
         ({"t_span": (0.0, 0.0)}, SpecificationError, "two different finite times"),
@@ -332,7 +387,7 @@ def test_the_command_keeps_what_was_measured_where_nothing_reaches_it(tmp_path, 
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("--limit", "0"), ("--error", "-1"), ("--seconds", "nan"), ("--limit", "inf"), ("--error", "x")],
+    [("--budget", "0"), ("--error", "-1"), ("--seconds", "nan"), ("--budget", "inf"), ("--error", "x")],
 )
 def test_the_command_refuses_what_is_no_positive_number_before_it_measures(option, value, capsys):
     with pytest.raises(SystemExit):

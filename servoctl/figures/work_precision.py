@@ -37,18 +37,27 @@ def draw_tradeoff(study, ax, cost, title, of):
     reached = np.maximum(front[of], floor)
     ax.plot(front[cost], reached, color=FRONT, linewidth=7, zorder=0, solid_capstyle="round")
     ax.scatter(front[cost], reached, s=70, color=FRONT, zorder=0)
+    _name_front(ax, front[LINES[key]].tolist(), front[cost], reached, colours)
     ax.set(xscale="log", yscale="log", xlabel=style.label(cost, "s" if cost == "seconds" else ""), title=title)
     ax.set(ylabel=f"error of the {'motion' if of == 'error' else of}, relative")
-    ax.set_xlim(good[cost].min(initial=1.0) / AXIS_MARGIN, good[cost].max(initial=1e-4) * AXIS_MARGIN)
+    low, high = good[cost].min(initial=1.0), good[cost].max(initial=1e-4)
+    ax.set_xlim(low / AXIS_MARGIN * (low / high) ** 0.15, high * AXIS_MARGIN)  # with room for names beside the front
     if not len(good):
         ax.text(0.5, 0.5, "every run failed", transform=ax.transAxes, ha="center")
-    low = max(floor, 1e-17)
-    ax.axhspan(low / 10, low, color=UNRESOLVED, zorder=-1)
-    ax.set_ylim(low / 10, min(3.0, max(10 * good[of].max(initial=low), 100 * low)))
+    least = max(floor, 1e-17)
+    ax.axhspan(least / 10, least, color=UNRESOLVED, zorder=-1)
+    ax.set_ylim(least / 10, min(3.0, max(10 * good[of].max(initial=least), 100 * least)))
     ax.grid(True, which="major", color="#DDDDDD", linewidth=0.6)
     keys = _keys(colours, [kind for kind in kinds if kind not in colours], dict.fromkeys(drift for *_, drift in lines))
     ax.legend(handles=keys, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, fontsize=8)
     return ax
+
+
+def _name_front(ax, names, costs, errors, colours):
+    """Write each name once, left of and below its cheapest point, where by definition nothing is drawn."""
+    for name in dict.fromkeys(names):
+        at, place = names.index(name), {"textcoords": "offset points", "ha": "right", "va": "top"}
+        ax.annotate(name, (costs[at], errors[at]), (-6, -2), color=colours[name], fontsize=9, **place)
 
 
 def _lines(study):

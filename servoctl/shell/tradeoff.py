@@ -17,7 +17,7 @@ def add_tradeoff(trade):
     trade.add_argument("--out", metavar="DIR", help="folder; default servoctl-runs/NAME-tradeoff")
     trade.add_argument("--method", nargs="+", metavar="M", help="methods to measure; default: all")
     trade.add_argument("--drift", type=drift, nargs="+", metavar="D", help="none, project, time constants [s]")
-    trade.add_argument("--limit", type=positive, metavar="S", help="seconds that one run may take; default 0.3")
+    trade.add_argument("--budget", type=positive, metavar="S", help="CPU time of all rows [s]; default 30")
     wanted = trade.add_mutually_exclusive_group()
     wanted.add_argument("--error", type=positive, metavar="E", help="recommend the fastest within this error")
     wanted.add_argument("--seconds", type=positive, metavar="S", help="recommend the most accurate within this time")
@@ -34,8 +34,8 @@ def _tradeoff(args):
 def _measured(args, name, scene, folder):
     report = Report()
     motion = described(args, scene, report)
-    limit = {} if args.limit is None else {"seconds": args.limit}
-    study = sv.tradeoff(motion.model, motion.start, motion.span, methods=args.method, drift=args.drift, **limit)
+    budget = {} if args.budget is None else {"budget": args.budget}
+    study = sv.tradeoff(motion.model, motion.start, motion.span, methods=args.method, drift=args.drift, **budget)
     report.say(study)
     folder.write(lambda path: study.save(path / "tradeoff.npz"))
     folder.write(lambda path: study.csv(path / "tradeoff.csv"))

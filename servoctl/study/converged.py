@@ -1,6 +1,7 @@
 """Converged motions of the models of one scene, and how far other motions are from that of the first."""
 
 import functools
+import os
 import time
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from servoctl.checks import numbers_by_name, texts
 from servoctl.errors import LimitExceeded, NameUnknown, ServoError, SpecificationError, unknown
 from servoctl.methods.accuracy import component_sizes, relative_error
-from servoctl.methods.choice import Adaptive, Algebraic, Project, Taylor
+from servoctl.methods.choice import Adaptive, Algebraic, Project, RadauIIA, Taylor, default_method
 from servoctl.methods.sizes import state_levels
 from servoctl.model.equations import signal_groups
 from servoctl.model.following import breaks_within
@@ -18,62 +19,101 @@ from servoctl.verification import verify
 
 INSTANTS = 51  # samples of adaptive methods while they are timed
 COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, and where in its interval each lies
-CHECKS = (Adaptive("DOP853", 3e-14, 1e-15), Taylor(12, rtol=1e-14, atol=1e-14))  # of a motion, in this order
+EXACT = (  # what a motion converges to, tried in this order: two that end, the implicit ones where it is stiff
+    *(Taylor(16, rtol=1e-15, atol=1e-15), Adaptive("DOP853", 3e-14, 1e-15), Adaptive("LSODA", 1e-13, 1e-15)),
+    *(RadauIIA(13, rtol=1e-14, atol=1e-15), RadauIIA(9, rtol=1e-13, atol=1e-14), Taylor(12, rtol=1e-14, atol=1e-14)),
+)
+FIRST = 0.3  # s of CPU after which a run for the reference waits until the others have been tried
 
 
 class Converged:
-    """The converged motion of a model, at any instants.
+    """The converged motion of a model, at any instants, and the run `check` at `times` of a method that verifies it.
 
-    `check` is the run at `times` of the method that verified it, the first that ends within ten times `seconds`.
+    Both are of the methods `EXACT` that need the least time, or of Newton's method where nothing is integrated; `cpu`
+    is the processor time of all that was tried [s].
     """
 
-    def __init__(self, model, start, span, seconds):
+    def __init__(self, model, start, span, bar):
+        began = cpu_seconds()
         consistent_state(model, start, span[0])
-        self.model, self.start, self.span, self._runs = model, start, span, {}
+        self.model, self.start, self.span = model, start, span
         t0, t1 = span
         self.knots = [k for k in breaks_within(model, span) if min(span) < k < max(span)]
         self.few = np.union1d(np.linspace(t0, t1, INSTANTS), self.knots)
         between = t0 + (t1 - t0) * (np.arange(COMPARED) + BETWEEN) / COMPARED
         self.times = np.unique([t0, *between, t1, *self.knots])
-        self.method, self.drift, checks = Taylor(16, rtol=1e-15, atol=1e-15), Project(), CHECKS
-        if model.flat:
-            self.method, self.drift, checks = Algebraic(), None, CHECKS[::-1]
         self.forces = [name for name, of in signal_groups(model.reduction).items() if of in ("actuation", "reaction")]
-        self.at(self.times)
-        self.checked_by, self.check = self._verified(checks, seconds)
+        found = {Algebraic(): self._run(Algebraic(), self.times, Deadline(np.inf, span, bar))} if model.flat else {}
+        self._find_two(found, bar)
+        self.method, self.checked_by = sorted(found, key=lambda each: getattr(each, "rtol", 0.0))
+        self.check, self._runs = found[self.checked_by], {self.times.tobytes(): found[self.method]}
+        self.cpu = cpu_seconds() - began
 
-    def _verified(self, checks, seconds):
-        """The first of the other methods that ends in time, and its run."""
-        for method in checks:
-            options = {"drift": Project(), "t_eval": self.times, "progress": Deadline(10 * seconds)}
+    def _run(self, method, times, progress=False):
+        options = {"drift": None if Project in method.refused else Project(), "t_eval": times, "progress": progress}
+        return whole_run(simulated(self.model, self.start, self.span, method, **options))
+
+    def _find_two(self, found, bar):
+        """Add runs by method until there are two; what takes long waits for what is expected to take less.
+
+        An untried method is expected to take twice as long as the longest attempt; series and implicit steps, which are
+        made first, as many times as there are states, as their Jacobian has so many columns.
+        """
+        series_pay = isinstance(default_method(self.model, None), Taylor)
+        waiting = dict.fromkeys(sorted(EXACT, key=lambda each: isinstance(each, Taylor) and not series_pay), 0.0)
+        dearest, failures = 0.0, []
+        while len(found) < 2:
+            if not waiting or len(failures) > 1 and not found:  # two methods say where it ends
+                raise failures[0]
+            expected = {
+                each: needed or dearest * (2 if isinstance(each, Adaptive) else len(self.model.state_names))
+                for each, needed in waiting.items()
+            }
+            method, began = min(expected, key=expected.get), cpu_seconds()
+            del waiting[method]
             try:
-                return method, whole_run(simulated(self.model, self.start, self.span, method, **options))
+                found[method] = self._run(
+                    method, self.times, Deadline(max(FIRST, 2 * expected[method]), self.span, bar)
+                )
             except ServoError as error:
-                failure = error
-        raise failure
+                if "needed" in error.details:
+                    waiting[method] = error.details["needed"]
+                else:
+                    failures.append(error)
+            dearest = max(dearest, cpu_seconds() - began)
 
     def at(self, times):
         """The run with samples at these times (N,) [s]."""
         key = times.tobytes()
         if key not in self._runs:
-            run = simulated(self.model, self.start, self.span, self.method, drift=self.drift, t_eval=times)
-            self._runs[key] = whole_run(run)
+            self._runs[key] = self._run(self.method, times)
         return self._runs[key]
 
 
-class Deadline:
-    """A `progress` for `simulate` that stops a run some seconds after its first step."""
+def cpu_seconds():
+    """Processor time of this process and of the compilers that it has called [s]."""
+    return time.process_time() + sum(os.times()[2:4])
 
-    def __init__(self, seconds):
-        self.seconds, self.since, self.steps = seconds, None, 0
+
+class Deadline:
+    """A `progress` for `simulate` that stops a run some seconds of processor time after its first step.
+
+    What it raises has the seconds that the whole run would need.
+    """
+
+    def __init__(self, seconds, span, bar=None):
+        self.seconds, self.span, self.bar, self.since = seconds, span, bar, None
 
     def __call__(self, t):
         """Raise LimitExceeded when the time is over."""
-        now = time.perf_counter()
-        self.since, self.steps = self.since or now, self.steps + 1
-        if now - self.since > self.seconds:
+        self.since = self.since or cpu_seconds()
+        spent, (t0, t1) = cpu_seconds() - self.since, self.span
+        if self.bar is not None:
+            self.bar.update(0)  # the time that it shows
+        if spent > self.seconds:
+            needed = spent * (t1 - t0) / (t - t0) if t != t0 else np.inf
             raise LimitExceeded(
-                f"More than {self.seconds:g} s: ended at t = {t:.4g} s", seconds=self.seconds, steps=self.steps, t=t
+                f"More than {self.seconds:.2g} s of CPU: ended at t = {t:.4g} s of {t1:g} s", needed=needed, t=t
             )
 
 
@@ -129,6 +169,7 @@ class Comparison:
             "error": max(self.off(*pair) for pair in pairs),
             "actuation": float(np.fmax.reduce([self.forces_off(*pair) for pair in pairs], initial=0.0)),
             "energy": verify(first.at(first.times)).numbers.get("energy", np.nan),
+            "cpu": sum(motion.cpu for motion in self.motions),
         }
 
 
@@ -149,5 +190,5 @@ def _values(run, names):
 
 def in_words(method):
     """A method with its order and its tolerance."""
-    order = f" of order {method.order}" if isinstance(method, Taylor) else ""
+    order = f" of order {method.order}" if isinstance(method, (Taylor, RadauIIA)) else ""
     return f"{method}{order}" + (f" at {method.rtol:g}" if hasattr(method, "rtol") else "")

@@ -2,7 +2,9 @@
 
 import time
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from servoctl.model.model import Model
 from servoctl.model.start import State
 from servoctl.progress import progress_bar
 from servoctl.simulation import as_state, simulated
-from servoctl.study.converged import Comparison, Converged, Deadline
+from servoctl.study.converged import Comparison, Converged, Deadline, cpu_seconds
 from servoctl.study.executor import whole_run
 from servoctl.study.table import SHOWN, Study, machine, table
 from servoctl.values import evenly
@@ -33,8 +35,7 @@ MEASURED = tuple(name for name in METHODS if name != "bounded")  # which solves 
 OF_MODELS = ("Taylor", "RadauIIA")  # default methods where models are compared: the second for stiff ones
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 STEP_COUNTS = tuple(5 * 4**k for k in range(7))  # steps of a fixed length in the span
-TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take this part of `seconds` together
-FEW = 20  # steps: a run that takes too long for fewer has diverged, and says nothing about finer settings
+TIMED, ENOUGH = 3, 0.3  # calls timed after a warm-up, fewer where they take this part of a run's limit together
 TIME_CONSTANT = 50  # default time constants of the poles in the span
 DRIFTS = ("none", "project")  # words of the column drift; others are time constants of poles
 COSTS = ("seconds", "evaluations", "steps")
@@ -81,7 +82,8 @@ class TradeOff(Study):
     of one evaluation of the rates, or of Newton's step; evaluations of the right-hand side, or of the series, or Newton
     steps; steps; seconds: the shortest call after a warm-up, with 51 samples for adaptive methods (more samples take
     longer), and one at each instant or step for the others; resolved: whether the error of integration exceeds the
-    uncertainty of the converged motions; failure: why there are no numbers.
+    uncertainty of the converged motions, as finer settings than one that does not are left out; failure: why there are
+    no numbers. What a method could not measure, if more than one setting, is one row without a value.
     """
 
     COLUMNS = (
@@ -157,9 +159,7 @@ class TradeOff(Study):
         if len(front):
             row = front.rows()[-1 if wanted == "error" else 0]
             best = max(row[of], self.meta["reference"][of])
-            nearest = f"{row['model']}, " if row["model"] else ""
-            nearest += f"{row['method']}, drift {row['drift']}, {row['setting']} {row['value']:g}: "
-            nearest += f"{of} {best:.2g} in {row['seconds']:.2g} s"
+            nearest = f"{_in_words(row)}: {of} {best:.2g} in {row['seconds']:.2g} s"
         reason = "no measured setting reaches it" if len(front) else "every run failed, see the column failure"
         return LimitExceeded(
             f"{wanted}={limit:g} was given, and {reason}.",
@@ -188,25 +188,40 @@ class TradeOff(Study):
 
         return draw_tradeoff(self, ax, named(cost, COSTS, "cost"), text("title", title), named(of, ERRORS, "error"))
 
-    def _tables(self):
-        return Shown._tables(self)
+    _tables = Shown._tables
+
+    def _advice(self, front):
+        """One sentence: the middle of the front, and below which error a single method is left."""
+        if not len(front):
+            return "no row has numbers, see the column failure"
+        row, good = front.rows()[len(front) // 2], self.take(np.flatnonzero(np.isfinite(self["error"])))
+        kind = "model" if len(self.meta["models"]) > 1 else "method"
+        best = sorted((good.where(**{kind: name})._errors("error").min(), name) for name in set(good[kind].tolist()))
+        alone = len(best) > 1 and f"{best[1][0]:.0e}" != f"{best[0][0]:.0e}"
+        only = f"; below {best[1][0]:.0e} only {best[0][1]}" if alone else ""
+        return f"{_in_words(row)}: {max(row['error'], self.uncertainty):.0e} for {1e3 * row['seconds']:.2g} ms{only}"
 
     def __repr__(self):
         t0, t1 = self.meta["t_span"]
         reference, where = self.meta["reference"], self.meta["machine"]
         front = self.pareto()
         shown = evenly(len(front), SHOWN)
+        kinds = Counter(why.partition(":")[0] for why in self["failure"].tolist() if why)
         lines = [
-            f"Trade-off: {len(self)} rows, {int(np.isnan(self['error']).sum())} without numbers; t = {t0:g} .. {t1:g} s"
-            + ("; interrupted" if self.meta.get("message") else ""),
+            f"Trade-off{', interrupted' * bool(self.meta.get('message'))}: t = {t0:g} .. {t1:g} s, {len(self)} rows, "
+            f"{int(np.isnan(self['error']).sum())} empty"
+            + f" ({', '.join(f'{count} {kind}' for kind, count in kinds.most_common())})" * bool(kinds)
+            + f"; {self.meta['left out']} finer left out" * bool(self.meta["left out"]),
             f"  reference: {reference['method']}; {reference['verified by']} agrees to {reference['error']:.1e}, "
             f"actuation to {reference['actuation']:.1e}",
-            f"  on {where['processor']}, {where['cores']} cores, compiler {where['compiler']}",
-            f"  fastest for each error, {len(shown)} of {len(front)}:" if len(front) else "  every run failed",
+            f"  CPU {reference['cpu']:.2g} s for the reference, {self.meta['cpu']:.2g} of {self.meta['budget']:g} s "
+            f"for rows; {where['processor']}, {where['cores']} cores, compiler {where['compiler']}",
+            f"  {self._advice(front)}"
+            + (f". Fastest for each error, {len(shown)} of {len(front)}:" if len(front) else ""),
         ]
         names = ("method", "drift", "setting", "value", "error", "actuation", "evaluations", "seconds")
         names = ("model", *names) if len(self.meta["models"]) > 1 else names
-        return "\n".join([*lines, *table(front.take(shown), names, SHOWN)])
+        return "\n".join([*(line[:120] for line in lines), *table(front.take(shown), names, SHOWN)])
 
 
 def tradeoff(
@@ -217,15 +232,15 @@ def tradeoff(
     drift: Sequence | None = None,
     *,
     outputs: Sequence[str] | Mapping[str, float] | None = None,
-    seconds: float = 0.3,
+    budget: float = 30.0,
     progress: bool | None = None,
 ) -> TradeOff:
     """Measure error and cost of methods, settings and treatments of drift on one motion, of one model or several.
 
-    The reference is the Taylor method of order 16 at a tolerance of 1e-15, or, where nothing is integrated, Newton's
-    method at each instant. A second method verifies it. Their difference is the uncertainty of the reference; smaller
-    errors are marked as not resolved. The motions of simpler models of the same scene are compared with that of the
-    first one: what they save in time, and cost in error.
+    The reference is the Taylor method of order 16 at a tolerance of 1e-15, Radau IIA of order 13 at 1e-14 where series
+    take longer, or, where nothing is integrated, Newton's method at each instant. A second method verifies it. Their
+    difference is the uncertainty of the reference; smaller errors are marked as not resolved. The motions of simpler
+    models of the same scene are compared with that of the first one: what they save in time, and cost in error.
 
     Main arguments
 
@@ -252,9 +267,9 @@ def tradeoff(
     outputs : sequence of str, or dict of str to float, optional
         Signals that all models have, of which the error is taken, or the sizes to which it is relative by their names,
         in their units; default: the coordinates and rates that all have, relative to their largest magnitudes.
-    seconds : float
-        Time that one run may take [s]. A longer one is stopped, and finer settings are skipped if it had taken more
-        than a few steps; the column failure says so.
+    budget : float
+        Processor time of all rows [s], that of compilers included and that of the reference, which is printed, apart.
+        Those that need least are measured first; the column failure says what it did not suffice for.
     progress : bool, optional
         Show a progress bar; default: on a terminal, for work of more than a second.
 
@@ -276,26 +291,23 @@ def tradeoff(
         For invalid settings, and for models that have no coordinate in common.
     """
     models = _as_models(model)
-    span, limit = as_span(t_span), positive("seconds", seconds)
+    span, budget = as_span(t_span), positive("budget", budget)
     candidates = {name: _candidates(each, methods, drift, span, len(models)) for name, each in models.items()}
-    with warnings.catch_warnings():
+    total = sum(len(settings) for each in candidates.values() for *_, settings in each)
+    with warnings.catch_warnings(), progress_bar("tradeoff", progress, total, unit="run") as bar:
         warnings.simplefilter("ignore", RuntimeWarning)  # steps outside the stable range: their errors are measured
-        motions, rows = _converged(models, start, span, limit)
-        comparison, interrupted = Comparison(motions, outputs), False
-        total = sum(len(settings) for name in motions for *_, settings in candidates[name])
-        with progress_bar("tradeoff", progress, total, unit="run") as bar:
-            try:
-                for name, motion in motions.items():
-                    for candidate in candidates[name]:
-                        for row in _ladder(comparison, motion, candidate, limit):
-                            rows.append({"model": name, **row})
-                            bar.update()
-            except KeyboardInterrupt:
-                interrupted = True
+        motions, rows = _converged(models, start, span, bar)
+        comparison = Comparison(motions, outputs)
+        agreement, began = comparison.agreement, cpu_seconds()
+        ladders = [Ladder(name, motions[name], *candidate) for name in motions for candidate in candidates[name]]
+        message = _measure(ladders, comparison, budget, bar)
+    by_method = groupby(ladders, key=lambda each: (each.model, each.method))
+    rows += [row for _, group in by_method for row in _rows(list(group))]
     columns = {name: [row.get(name) for row in rows] for name in TradeOff.COLUMNS}
-    meta = {"t_span": list(span), "seconds": limit, "models": list(models), "outputs": comparison.names}
-    meta |= {"reference": comparison.agreement, "machine": machine(), "measured": time.strftime("%Y-%m-%d")}
-    return TradeOff("tradeoff", columns, meta | {"message": "interrupted" if interrupted else ""})
+    meta = {"t_span": list(span), "budget": budget, "cpu": cpu_seconds() - began, "models": list(models)}
+    meta |= {"left out": sum(each.unseen for each in ladders), "outputs": comparison.names, "reference": agreement}
+    meta |= {"machine": machine(), "measured": time.strftime("%Y-%m-%d"), "message": message}
+    return TradeOff("tradeoff", columns, meta)
 
 
 # --- models and their motions
@@ -311,13 +323,13 @@ def _as_models(given):
     return models
 
 
-def _converged(models, start, span, seconds):
+def _converged(models, start, span, bar):
     """The converged motions by model, and a row with the reason for each model but the first that has none."""
     motions, rows, (first, *_) = {}, [], models
     for name, model in models.items():
         try:
             near = start if name == first else _start_near(model, models[first], start, span[0])
-            motions[name] = Converged(model, near, span, seconds)
+            motions[name] = Converged(model, near, span, bar)
         except ServoError as error:
             if name == first:
                 raise
@@ -337,34 +349,82 @@ def _failure(error):
     return f"{type(error).__name__}: {error}"
 
 
-# --- one run
+# --- runs, the cheapest first
 
 
-def _ladder(comparison, motion, candidate, seconds):
-    """A row for each setting, from coarse to fine; those after the first too slow or unresolved one are skipped."""
-    method, treatment, settings = candidate
-    skipped, name = "", _kind(method)
-    for value in sorted(settings, reverse=True):
-        row = {"method": method, "drift": _drift_word(treatment), "setting": name, "value": value, "failure": skipped}
-        if not skipped:
-            try:
-                row |= _errors_and_cost(comparison, motion, method_at(method, value), treatment, value, seconds)
-                row["resolved"] = row["integration"] >= comparison.agreement["error"]
-                if not row["resolved"]:
-                    skipped = f"skipped: {name} = {value:g} reaches the uncertainty of the reference"
-                elif row["seconds"] > seconds:
-                    skipped = f"skipped: {name} = {value:g} took {row['seconds']:.2g} s, more than {seconds:g} s"
-            except SpecificationError as error:  # the combination is invalid at every setting: one row is enough
-                yield row | {"value": np.nan, "failure": str(error)}
-                return
-            except ServoError as error:
-                row["failure"] = _failure(error)
-                if error.details.get("steps", 0) > FEW:
-                    skipped = f"skipped: {name} = {value:g} took more than {seconds:g} s"
-        yield row
+def _measure(ladders, comparison, budget, bar):
+    """Measure settings within a budget [s of CPU], the one that needs least before all others; tells of Ctrl-C."""
+    waiting = sorted(ladders, key=lambda each: each.method in OF_MODELS)  # to make these takes longest
+    left, end = budget, cpu_seconds() + budget
+    try:
+        while waiting:
+            ladder, left = min(waiting, key=lambda each: each.needed), end - cpu_seconds()
+            if ladder.needed > left:
+                break
+            count = len(ladder.settings)
+            ladder.measure(comparison, left, left / len(waiting))
+            bar.update(count - len(ladder.settings))
+            waiting = [each for each in waiting if each.settings]
+    except KeyboardInterrupt:
+        return "interrupted"
+    for ladder in waiting:
+        ladder.leave(
+            f"Budget: {ladder.needed:.2g} s of CPU are needed, {max(left, 0):.2g} of {budget:g} s were left.",
+            len(ladder.settings),
+        )
+    return ""
 
 
-def _errors_and_cost(comparison, motion, method, treatment, value, seconds):
+class Ladder:
+    """The settings of a method and a treatment of drift that are still to be measured, and the rows of the others.
+
+    `needed` is the processor time that the next row is expected to need: that of the last one [s]; `unseen` is the
+    number of settings left out, as a coarser one reaches the uncertainty of the reference.
+    """
+
+    def __init__(self, model, motion, method, treatment, settings):
+        self.model, self.motion, self.method, self.treatment = model, motion, method, treatment
+        self.settings, self.needed, self.unseen, self.rows, self.failed = sorted(settings), 0.0, 0, [], []
+        self.same = {"model": model, "method": method, "drift": _drift_word(treatment), "setting": _kind(method)}
+
+    def measure(self, comparison, left, share):
+        """Measure the coarsest setting, by runs of an equal share of the time that is left, or twice what is needed."""
+        value, began, limit = self.settings[-1], cpu_seconds(), min(left, max(share, 2 * self.needed))
+        try:
+            row = _errors_and_cost(comparison, self.motion, method_at(self.method, value), self.treatment, value, limit)
+        except ServoError as error:
+            self.needed, needed = cpu_seconds() - began, error.details.get("needed")  # by runs that took too long
+            if needed is not None and needed < left - self.needed:
+                self.needed = needed  # the same setting again
+            else:  # finer settings are invalid, too, or take longer
+                finer = isinstance(error, SpecificationError) or needed is not None and self.rows
+                self.leave(_failure(error), len(self.settings) if finer else 1)
+            return
+        row["resolved"] = row["integration"] >= comparison.agreement["error"]
+        self.rows.append(self.same | row | {"value": self.settings.pop(), "failure": ""})
+        self.needed = cpu_seconds() - began
+        if not row["resolved"]:  # what is finer has no smaller error that could be seen
+            self.unseen, self.settings = len(self.settings), []
+
+    def leave(self, reason, count):
+        """The reason for so many of the settings that are left, the coarsest first."""
+        reason += f" Finer ones likewise: {count - 1}." * (count > 1)
+        self.failed.append(self.same | {"value": self.settings[-1], "failure": reason})
+        del self.settings[-count:]
+
+
+def _rows(ladders):
+    """The rows of a method: those with numbers, and one for all that failed."""
+    failed = [row for ladder in ladders for row in ladder.failed]
+    if len(failed) > 1:
+        first, *others = failed
+        drift = first["drift"] if len({row["drift"] for row in failed}) == 1 else ""
+        also = (f"{row['drift']} {row['value']:g}: {row['failure'].partition(':')[0]}" for row in others)
+        failed = [first | {"drift": drift, "value": np.nan, "failure": f"{first['failure']} Also {'; '.join(also)}."}]
+    return [*(row for ladder in ladders for row in ladder.rows), *failed]
+
+
+def _errors_and_cost(comparison, motion, method, treatment, value, limit):
     """Errors, counts and time of one setting."""
     (t0, t1), times = motion.span, motion.few
     if isinstance(method, Algebraic):
@@ -373,17 +433,14 @@ def _errors_and_cost(comparison, motion, method, treatment, value, seconds):
         times = None
 
     def at(times):
-        options = {"drift": treatment, "t_eval": times, "progress": Deadline(seconds)}
+        options = {"drift": treatment, "t_eval": times, "progress": Deadline(limit, motion.span)}
         return whole_run(simulated(motion.model, motion.start, motion.span, method, **options))
 
-    run, timed = at(times), []
-    for _ in range(TIMED):
+    runs, timed = [at(comparison.times)], []
+    while len(timed) < TIMED and sum(timed) <= ENOUGH * limit:
         since = time.perf_counter()
-        at(times)
+        run = at(times)
         timed.append(time.perf_counter() - since)
-        if sum(timed) > ENOUGH * seconds:
-            break
-    runs = [at(comparison.times)]
     if isinstance(method, Taylor) and t1 > t0:
         samples = np.union1d(np.linspace(t0, t1, DEFAULT_SAMPLES), motion.knots)
         runs.append(at(samples).sampled(comparison.times))
@@ -422,12 +479,12 @@ def _candidates(model, methods, drift, span, models):
     if methods is None:
         all_methods = [name for name in MEASURED if name != "algebraic"] if models == 1 else OF_MODELS
         methods = ["algebraic"] if model.flat else all_methods
-    if drift is None:
-        drift = (None, "project", length / TIME_CONSTANT) if models == 1 else ("project",)
+    default = (None, "project", length / TIME_CONSTANT) if models == 1 else ("project",)
+    wanted = default if drift is None else drift
     names = list(methods) if isinstance(methods, (list, tuple, dict)) else [methods]
     for method in names:
         named(method, METHODS, "method")
-    treatments = [as_drift(value) for value in (drift if isinstance(drift, (list, tuple)) else [drift])]
+    treatments = [as_drift(value) for value in (wanted if isinstance(wanted, (list, tuple)) else [wanted])]
     if any(isinstance(value, Poles) and not isinstance(value.values, float) for value in treatments):
         raise SpecificationError(
             "Poles by row were given.",
@@ -438,7 +495,8 @@ def _candidates(model, methods, drift, span, models):
     given = methods if isinstance(methods, dict) else dict.fromkeys(names)
     settings = {name: _settings(name, given[name], length) for name in names}
     pairs = [(m, None) for m in names if m == "algebraic"]
-    pairs += [(m, d) for m in names for d in treatments if m != "algebraic"]
+    integrated = [(m, d) for m in names for d in treatments if m != "algebraic"]
+    pairs += [(m, d) for m, d in integrated if drift is not None or type(d) not in as_method(m).refused]
     if not pairs:
         raise SpecificationError(
             f"methods={methods!r} and drift={drift!r} were given.",
@@ -474,6 +532,13 @@ def _drift_word(treatment):
 
 
 # --- methods and treatments in words
+
+
+def _in_words(row):
+    """Model, method, treatment and setting of a row."""
+    drift = {"none": "", "project": ", projected"}.get(row["drift"], f", drift {row['drift']}")
+    model = f"{row['model']}, " if row["model"] else ""
+    return f"{model}{row['method']} at {row['setting']} {row['value']:.3g}{drift}"
 
 
 def method_at(name, value):

@@ -100,7 +100,7 @@ def calls():
         "minimum_phase": (sv.minimum_phase, dict(model=s["model"], parameter="m", values=(1.5, 2.5), at=s["model"].start())),
         "stability": (sv.stability, dict(model=s["ideal"], run=s["free"], order=12)),
         "tradeoff": (sv.tradeoff, dict(model=s["ideal"], start=near, t_span=span, methods={"RK4": [0.1]}, drift=[None],
-                                       outputs=["y"], seconds=0.1, progress=False)),
+                                       outputs=["y"], budget=0.1, progress=False)),
         "sampled_bound": (sv.sampled_bound, dict(rho=2, delay=1)),
         "plant": (sv.plant, dict(mechanism=s["mechanism"], forces={"x": -y}, damping={"x": 1.0},
                                  limits={"pull": (-1.0, 2.0)}, rate_limits={"pull": 3.0}, lag={"lift": 0.1}, delay=0.01,
