@@ -171,11 +171,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, _ends_of_steps(knots, span, max_step, method), events)
     try:
-        motion = _tolerant(model, method, drift, problem, bar)
-    except Unsuited as unsuited:
-        method = unsuited.method
-        motion = _tolerant(model, method, drift, problem, bar)
-        motion.say(f"by {method}, since {unsuited}")
+        method, motion = _suited(model, method, drift, problem, bar)
     finally:
         bar.close()
 
@@ -193,6 +189,17 @@ def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t
     if run.success and not model.flat and not motion.drifted <= DRIFTED:
         _warn_drifted(run)
     return run
+
+
+def _suited(model, method, drift, problem, bar):
+    """The motion and its method, in place of a default that does not suit it."""
+    try:
+        return method, _tolerant(model, method, drift, problem, bar)
+    except Unsuited as unsuited:
+        method, motion = _suited(model, unsuited.method, drift, problem, bar)
+        if method is unsuited.method:
+            motion.say(f"by {method}, since {unsuited}")
+        return method, motion
 
 
 def _ends_of_steps(knots, span, max_step, method):
