@@ -488,7 +488,9 @@ RATTLEBACK_END = {
     "w2": 0.026466125545, "w3": 1.524851985675,
 }  # fmt: skip
 SNAKEBOARD_END = {"x": 11.88197360018, "y": -0.010956722500, "theta": -0.604740264942}
-BRICARD_END = {}
+BRICARD_END = {
+    "a1": 0.235697968378, "a2": -0.190462461318, "a3": 0.235697968378, "da1": -0.997092378002, "da2": 0.648918925858,
+}  # fmt: skip
 
 TEST_SET, LIBRARY = "IVP test set, release 2.4", "IFToMM's library of benchmarks, González et al. (2006)"
 PROBLEMS = {
@@ -568,7 +570,7 @@ def ours(problem, model, start, method):
 def peers(problem, model, start):
     """SciPy's methods on our rates, with the pivots that a motion begins with: a list of (label, call)."""
     x0 = np.array(getattr(start, "values", start), dtype=float)
-    model = sv.simulate(model, start, (0.0, problem.until * 1e-3)).variant(0)[0]
+    model = sv.simulate(model, start, (0.0, problem.until * 1e-3)).variant(0)
     f, names, p, until = model.function("ode"), list(model.state_names), model.p, problem.until
 
     def call(method, rtol):

@@ -307,22 +307,26 @@ class Unsuited(Exception):
 def leave_if_unsuited(steps, method, limit, t, x, interpreted):
     """Leave a motion to a method that suits it better, after steps with ends t (S + 1,) [s], which lead to x (n_x,).
 
-    Where stability limits them, or where many are to come that are not compiled, and those of the method are. Without
-    a method the motion says that stability limits them.
+    That is where stability limits them, or where many are to come that are not compiled; not to RadauIIA where its code
+    has more operations than steps are to come, which takes longer to compile. A motion that stays says that stability
+    limits its steps.
     """
     told = "stability" in steps.motion.note or steps.method not in ("Taylor", *EXPLICIT)
     if method is None and told:
         return
     length, p = abs(t[-1] - t[0]) / (len(t) - 1), steps.model.p
     forward, mean = np.copysign(steps.length, t[-1] - t[0]), np.array([length])
+    compiles = isinstance(method, RadauIIA) and steps.model.function("ode_jacobian").operations
+    long = compiles > TAYLOR_COMPILED
     if stiff(steps.model, t[-1:], x[:, None], p[:, None], mean, forward, limit)[0]:
         why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
-        if method is not None:
+        if method is not None and not (long and steps.length < compiles * length):
             raise Unsuited(why, method)
-        steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
-    if interpreted and isinstance(method, RadauIIA) and steps.family is None:
+        if not told:
+            steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
+    elif interpreted and compiles and not long and steps.family is None:
         count = steps.motion.counters["steps"] * steps.length / abs(t[-1] - steps.span[0])
-        if count >= MANY_STEPS and steps.model.function("ode_jacobian").operations <= TAYLOR_COMPILED:
+        if count >= MANY_STEPS:
             raise Unsuited(f"its steps are compiled, and {steps.method} would take about {count:.0f} in Python", method)
 
 
