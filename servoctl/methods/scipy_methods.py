@@ -84,7 +84,7 @@ class ScipySteps(BulkSteps):
             t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
         self._count(len(z))
-        if 2 * len(z) >= AT_ONCE:  # 1.0: a mode that decays within each step
+        if 4 * len(z) >= AT_ONCE:  # 1.0: a mode that decays within each step
             leave_if_unsuited(self, self.for_stiff, 1.0, np.array(t), x[-1], True)
         self.most = min(2 * self.most, AT_ONCE)
         if not self.failure and self._creeps(len(z)):
