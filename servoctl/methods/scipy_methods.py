@@ -7,11 +7,11 @@ import numpy as np
 from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.choice import Project
 from servoctl.methods.edges import edge
+from servoctl.methods.pieces import AT_ONCE
 from servoctl.methods.radau import Collocated, rates_at
 from servoctl.methods.taylor import leave_if_unsuited
 
 DEGREES = {"RK45": 4, "DOP853": 7, "Radau": 3, "LSODA": 12}  # of the polynomials of dense output
-AT_ONCE = 16  # steps that are inspected together, at most: twice as many each time
 MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
 
 

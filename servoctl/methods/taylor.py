@@ -24,7 +24,7 @@ from servoctl.methods.edges import Edges
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
-from servoctl.methods.pieces import RESOLUTION, End, Tolerance, net
+from servoctl.methods.pieces import AT_ONCE, RESOLUTION, End, Tolerance, net
 from servoctl.methods.sizes import from_start
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
@@ -36,7 +36,6 @@ LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling 
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
 FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
 MANY_STEPS = 50  # of this length in the span: more of them in Python take three times as long as compiled implicit ones
-AT_FIRST = 16  # steps of a series that is not compiled, after which another method may go on
 LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
 OF_PIECE = ca.SX.sym("t_of_piece")  # the instant that selects pieces of paths
@@ -326,8 +325,8 @@ def leave_if_unsuited(steps, method, limit, t, x, interpreted):
             steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
     elif interpreted and compiles and not long and steps.family is None:
         count = steps.motion.counters["steps"] * steps.length / abs(t[-1] - steps.span[0])
-        if count >= MANY_STEPS:
-            raise Unsuited(f"its steps are compiled, and {steps.method} would take about {count:.0f} in Python", method)
+        if count > MANY_STEPS:
+            raise Unsuited(f"its steps are compiled, and {steps.method} takes more than {MANY_STEPS} in Python", method)
 
 
 def stiff(model, t, x, p, steps, span, limit):
@@ -365,7 +364,7 @@ class TaylorSteps(Stepping):
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
         self.long = self.f.operations > TAYLOR_COMPILED
-        self.most = AT_FIRST if self.long else 100  # steps per call of the loop
+        self.most = AT_ONCE if self.long else 100  # steps per call of the loop
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
