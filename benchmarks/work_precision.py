@@ -51,11 +51,11 @@ Measured on {processor}, {cores} cores, {system}, compiler {compiler}, with othe
 - Where the program leaves nothing to integrate (overhead-crane, vtol), solving each instant is exact to rounding. An
   integration of the same program drifts, unless projection solves it again after each step.
 
-`sv.simulate` follows from this: each instant solved where nothing is integrated; else the Taylor method, and Radau IIA
-where a hundred steps show that stability limits those of a series, which the run's message then says. DOP853 takes its
-place with poles, which series exclude, where pivots change along the motion, as each choice of them has a series of
-its own, and where the rates have more than 300 operations, as making a series takes seconds.
-`accuracy=1e-6` adds projection and a tolerance that is lowered until two motions agree to the accuracy.
+`sv.simulate` follows from this: each instant solved where nothing is integrated; else the Taylor method. DOP853, which
+needs no compiler, takes its place with poles, which series exclude, and where the rates have more than 300 operations,
+as making a series takes seconds. Both give way to Radau IIA where stability limits their steps, and where more than 50
+steps are to come that are not compiled, which the run's message then says; not where its own code has so many
+operations that compiling it would take longer. `accuracy=1e-6` adds projection and a tolerance that is lowered until two motions agree to the accuracy.
 
 ## The fastest setting for an error
 

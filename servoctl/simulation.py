@@ -60,8 +60,8 @@ from servoctl.run import SAME_TIME, Run
 STEPS_IN_SPAN = 2000  # steps of fixed length in a span if the method has no step
 MOST_STEPS = 10**8  # of fixed length: more would fill the memory with samples
 MOST_ENDS = 10**6  # of steps that `max_step` asks for: more would fill the memory
+OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent, and a run says so
 DRIFTED = 1e-2  # the same at the end of a motion that deserves a warning
-OFF = 1e-5  # residual relative to its gradient times the state, above which a start is inconsistent
 
 
 def simulate(
@@ -171,11 +171,7 @@ def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t
     times = None if isinstance(method, Bounded) and t_eval is None else sample_times(t0, t1, t_eval, knots, method)
     bar, problem = Progress(span, progress), (t0, x0, t1, times, _ends_of_steps(knots, span, max_step, method), events)
     try:
-        motion = _tolerant(model, method, drift, problem, bar)
-    except Unsuited as unsuited:
-        method = unsuited.method
-        motion = _tolerant(model, method, drift, problem, bar)
-        motion.say(f"by {method}, since {unsuited}")
+        method, motion = _suited(model, method, drift, problem, bar)
     finally:
         bar.close()
 
@@ -190,9 +186,20 @@ def simulated(model, start, t_span, method=None, *, drift=None, max_step=None, t
     if motion.stop is not None:
         motion.stop.run = run
         raise motion.stop
-    if run.success and not model.flat and not motion.drifted <= DRIFTED:
-        _warn_drifted(run)
+    if run.success and not model.flat and not motion.drifted <= OFF:
+        return _drifted(run)
     return run
+
+
+def _suited(model, method, drift, problem, bar):
+    """The motion and its method, in place of a default that does not suit it."""
+    try:
+        return method, _tolerant(model, method, drift, problem, bar)
+    except Unsuited as unsuited:
+        method, motion = _suited(model, unsuited.method, drift, problem, bar)
+        if method is unsuited.method:
+            motion.say(f"by {method}, since {unsuited}")
+        return method, motion
 
 
 def _ends_of_steps(knots, span, max_step, method):
@@ -238,13 +245,17 @@ def _interrupted_at_its_end(run):
     return replace(run, success=False, status=1, message=f"{run.message}; interrupted at its end")
 
 
-def _warn_drifted(run):
-    """Warn where the last state violates a constraint more than any start may."""
+def _drifted(run):
+    """A run that says where its last state violates a constraint more than any start may, and warns of much more."""
     model, x = run.variant(len(run.t) - 1), run.jets[: len(run.model.state_names), -1]
     names, values, off = _scaled_residuals(model, run.t[-1], x)
-    if off.max(initial=0.0) > DRIFTED:
-        worst = int(np.argmax(off))
-        warn_drifted(names[worst], float(values[worst]), float(run.t[-1]), run.method)
+    if off.max(initial=0.0) <= OFF:
+        return run
+    worst = int(np.argmax(off))
+    name, value = names[worst], float(values[worst])
+    if off[worst] > DRIFTED:
+        warn_drifted(name, value, float(run.t[-1]), run.method)
+    return replace(run, message=f"{run.message}; the residual of {name!r} has drifted to {value:.2g}")
 
 
 def _has_internal_dynamics(model):

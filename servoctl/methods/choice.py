@@ -355,13 +355,14 @@ class Automatic(Taylor):
 
     @property
     def without_series(self):
-        """What goes on where pivots change or the equations are no series; None for an order that is required."""
-        return Adaptive(rtol=self.rtol, atol=self.atol) if self.jets is None and self.order is None else None
+        """What goes on where the equations are no series; None for an order that is required."""
+        suits = self.jets is not None or self.order is not None
+        return None if suits else AutomaticAdaptive(rtol=self.rtol, atol=self.atol)
 
 
 @frozen(repr=False)
 class AutomaticAdaptive(Adaptive):
-    """DOP853 as a default, in whose place another method takes stiff equations."""
+    """DOP853 as a default, in whose place another method takes stiff equations and long motions."""
 
     for_stiff = property(lambda self: _implicit(self))
 

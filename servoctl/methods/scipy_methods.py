@@ -7,11 +7,11 @@ import numpy as np
 from servoctl.methods.bulk import BulkSteps
 from servoctl.methods.choice import Project
 from servoctl.methods.edges import edge
+from servoctl.methods.pieces import AT_ONCE
 from servoctl.methods.radau import Collocated, rates_at
-from servoctl.methods.taylor import leave_if_stiff
+from servoctl.methods.taylor import leave_if_unsuited
 
 DEGREES = {"RK45": 4, "DOP853": 7, "Radau": 3, "LSODA": 12}  # of the polynomials of dense output
-AT_ONCE = 16  # steps that are inspected together, at most: twice as many each time
 MANY, CREEPS = 200, 1e-5  # steps in which a motion near the edge of a domain passes this part of the span
 
 
@@ -26,7 +26,7 @@ def nodes_of(method):
 class ScipySteps(BulkSteps):
     """One integration by one of scipy's methods, `choice.SCIPY`.
 
-    Where stability limits the steps, the motion is left to the method `for_stiff`, if there is one.
+    Where stability limits the steps, or there are many, the motion is left to the method `for_stiff`, if there is one.
     """
 
     advice = "Use a larger rtol or a method for stiff equations ('Radau'), or check whether the motion escapes."
@@ -83,10 +83,10 @@ class ScipySteps(BulkSteps):
                 self._project()
             t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
-        if len(z) == AT_ONCE:
-            leave_if_stiff(self, self.for_stiff, 1.0, np.array(t), x[-1])  # a mode that decays within each step
-        self.most = min(2 * self.most, AT_ONCE)
         self._count(len(z))
+        if 4 * len(z) >= AT_ONCE:  # 1.0: a mode that decays within each step
+            leave_if_unsuited(self, self.for_stiff, 1.0, np.array(t), x[-1], True)
+        self.most = min(2 * self.most, AT_ONCE)
         if not self.failure and self._creeps(len(z)):
             self.failure = "its steps shrink"
         return Collocated(

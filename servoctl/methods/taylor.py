@@ -13,18 +13,18 @@ from math import factorial, perm
 import casadi as ca
 import numpy as np
 
-from servoctl.codegen.function import Compiled, compiled
+from servoctl.codegen.function import TAYLOR_COMPILED, Compiled, compiled
 from servoctl.codegen.interpreted import weighted
 from servoctl.codegen.paths import BY_INSTANT
 from servoctl.dense import steps_of
 from servoctl.jets.factors import constants_outside
 from servoctl.jets.series import Motion, Series, is_zero, over, shifted
-from servoctl.methods.choice import EXPLICIT, Project
+from servoctl.methods.choice import EXPLICIT, Project, RadauIIA
 from servoctl.methods.edges import Edges
 from servoctl.methods.independent import in_independent, solved_for
 from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
-from servoctl.methods.pieces import RESOLUTION, End, Tolerance, net
+from servoctl.methods.pieces import AT_ONCE, RESOLUTION, End, Tolerance, net
 from servoctl.methods.sizes import from_start
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
@@ -36,6 +36,7 @@ LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling 
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
 FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
 STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
+MANY_STEPS = STIFF_STEPS // 8  # the same of steps in Python, which take eight times as long
 LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
 OF_PIECE = ca.SX.sym("t_of_piece")  # the instant that selects pieces of paths
@@ -303,21 +304,30 @@ class Unsuited(Exception):
         self.method = method
 
 
-def leave_if_stiff(steps, method, limit, t, x):
-    """Leave a motion to a method where stability limits its steps, with ends t (S + 1,) [s], which lead to x (n_x,).
+def leave_if_unsuited(steps, method, limit, t, x, interpreted):
+    """Leave a motion to a method that suits it better, after steps with ends t (S + 1,) [s], which lead to x (n_x,).
 
-    Without a method the motion says so.
+    That is where stability limits them, or where many are to come that are not compiled; not to RadauIIA where its code
+    has more operations than steps are to come, which takes longer to compile. A motion that stays says that stability
+    limits its steps.
     """
     told = "stability" in steps.motion.note or steps.method not in ("Taylor", *EXPLICIT)
     if method is None and told:
         return
     length, p = abs(t[-1] - t[0]) / (len(t) - 1), steps.model.p
     forward, mean = np.copysign(steps.length, t[-1] - t[0]), np.array([length])
+    compiles = isinstance(method, RadauIIA) and steps.model.function("ode_jacobian").operations
+    long = compiles > TAYLOR_COMPILED
     if stiff(steps.model, t[-1:], x[:, None], p[:, None], mean, forward, limit)[0]:
         why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
-        if method is not None:
+        if method is not None and not (long and steps.length < compiles * length):
             raise Unsuited(why, method)
-        steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
+        if not told:
+            steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
+    elif interpreted and compiles and not long and steps.family is None:
+        count = steps.motion.counters["steps"] * steps.length / abs(t[-1] - steps.span[0])
+        if count > MANY_STEPS:
+            raise Unsuited(f"its steps are compiled, and {steps.method} takes more than {MANY_STEPS} in Python", method)
 
 
 def stiff(model, t, x, p, steps, span, limit):
@@ -340,7 +350,6 @@ class TaylorSteps(Stepping):
     With atol (n_x,) in place of a number, entries of a level are compared in their own tolerances.
     """
 
-    most = 100  # steps per call of the compiled loop
     rank_lost = "the radius of convergence shrinks to nothing"
     advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
@@ -355,6 +364,8 @@ class TaylorSteps(Stepping):
         self.model, self.n_x, self.p = model, len(model.state_names), np.append(model.p, np.nan)
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
+        self.long = self.f.operations > TAYLOR_COMPILED
+        self.most = AT_ONCE if self.long else 100  # steps per call of the loop
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
@@ -461,8 +472,8 @@ class TaylorSteps(Stepping):
             a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
             if steps == self.most:
-                order = self.last - self.top + 1
-                leave_if_stiff(self, getattr(self.settings, "for_stiff", None), order / np.e, t, x)
+                order, method = self.last - self.top + 1, getattr(self.settings, "for_stiff", None)
+                leave_if_unsuited(self, method, order / np.e, t, x, self.long)
             if not fine:
                 self._follow(outcome)
             elif failed:
@@ -478,12 +489,6 @@ class TaylorSteps(Stepping):
         method = getattr(self.settings, "without_series", None)
         if method is not None and self.doubted > MOST_DOUBTED:
             raise Unsuited(f"near t = {t:.4g} s the equations are no series over the steps of {self.method}", method)
-
-    def _go_on(self, variant, t, x):
-        method = getattr(self.settings, "without_series", None)
-        if method is not None:
-            raise Unsuited(f"at t = {t:.4g} s the equations change their form, and {self.method} its series", method)
-        super()._go_on(variant, t, x)
 
     def _believed(self, log, span):
         """The number of steps whose series meet the equations, at instants within them.
