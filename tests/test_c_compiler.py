@@ -251,6 +251,19 @@ def test_a_compiler_that_does_not_serve_is_warned_about(fresh, tmp_path, monkeyp
     assert model.backend == "casadi"
 
 
+def test_a_compiler_that_hangs_is_asked_once(fresh, tmp_path, monkeypatch):
+    command, log = tmp_path / "slow-cc", tmp_path / "log"
+    command.write_text(f"#!/bin/sh\necho asked >> {log}\nexec sleep 60\n", encoding="utf-8")
+    command.chmod(0o755)
+    monkeypatch.setenv("SERVOCTL_COMPILER", str(command))
+    monkeypatch.setattr(compiler, "PATIENCE_WITH_COMPILER", 0.3)
+    monkeypatch.setattr(compiler, "_hanging", set())
+    with warned("slow-cc"):
+        assert compiler.library("int one(void) { return 1; }") is None
+    asked = log.read_text(encoding="utf-8")
+    assert compiler.library("int two(void) { return 2; }") is None and log.read_text(encoding="utf-8") == asked
+
+
 @pytest.mark.parametrize("variable", ["SERVOCTL_COMPILER", "CC"])
 @pytest.mark.parametrize("command", ["nothing-of-this-name -O9", "nothing 'of this name", "/no/such/gcc"])
 def test_a_named_compiler_that_does_not_exist_is_warned_about(fresh, monkeypatch, variable, command):

@@ -29,7 +29,7 @@ from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
 from servoctl.progress import stage
 
-PATIENCE_WITH_COMPILER = 600.0  # s: one that takes longer waits for something, such as a licence
+PATIENCE_WITH_COMPILER = 120.0  # s: one that takes longer waits for something, such as a licence
 USUAL = ("cc", "gcc", "clang")  # compilers that are looked for
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
 ROUNDED = ("-ffp-contract=off", "-fno-builtin-pow")  # every operation rounds by itself; pow is that of the C library
@@ -38,6 +38,7 @@ _loaded = {}  # key -> ctypes.CDLL, or None where it could not be built
 _locks = {}  # key -> lock: no two threads compile the same text
 _guard = threading.Lock()
 _warned = False
+_hanging = set()  # commands that did not answer, and are not asked again
 _fewest = contextvars.ContextVar("fewest calls that are worth compiling", default=0)
 
 
@@ -182,6 +183,8 @@ def _build(text, flags, file_name, command):
     """
     import subprocess
 
+    if command in _hanging:
+        return None
     for directory in (cache_directory, _scratch):
         try:
             return _compile(text, flags, directory() / file_name, command)
@@ -189,6 +192,7 @@ def _build(text, flags, file_name, command):
             failed = error
         except subprocess.TimeoutExpired:
             failed = f"no answer within {PATIENCE_WITH_COMPILER:g} s"
+            _hanging.add(command)
             break
     return _without(f"{' '.join(command)} failed: {failed}")
 

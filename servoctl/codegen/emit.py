@@ -24,7 +24,7 @@ from servoctl.values import frozen
 
 CHUNK = 350  # statements per C function: compile time is least, and flat, between 250 and 500
 WIDE = 3000  # operations: up to here a function is emitted for eight points at once as well
-COLLECTED = 4000  # operations: up to here collecting like terms takes at most half a second
+COLLECTED = 2000  # operations: up to here collecting like terms takes at most a third of a second
 SHARED = 2  # divisions by the same value: from here on they become products with its reciprocal
 PHASES = ("instant", "correction", "rest")  # of t and p alone; for a Newton correction; for the other outputs
 SERIES = ("still", "moving")  # of p alone; all others

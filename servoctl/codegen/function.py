@@ -344,7 +344,7 @@ class Compiled:
 
     @property
     def _level(self):
-        if {*self.loops} <= {"rk"} or self.source().count(";") > FULLY_OPTIMISED:
+        if {*self.loops} <= {"rk", "radau"} or self.source().count(";") > FULLY_OPTIMISED:
             return "-O1"
         return ALONG_A_PATH if self.loops == ("newton",) else "-O3"  # as fast there, with the same bits
 
