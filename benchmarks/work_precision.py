@@ -32,7 +32,8 @@ on what else it does; evaluations do not.
 The rows take at most 30 s of processor time, or `budget=`, and those that need least come first: every method has a row
 before any has its finest setting. The reference is apart, and what it took is printed. What a method cannot do on a
 scene, or not in the time that is left, is one row with the reasons. One sentence above the table says what to take,
-such as "RadauIIA at rtol 1e-07: 4e-09 for 11 ms; below 2e-10 only RK8", and the figure names the methods on the front.
+such as "RadauIIA at rtol 1e-07: 4e-09 for 11 ms; of these rows, below 2e-10 only RK8", and the figure names the methods
+on the front.
 
 Measured on {processor}, {cores} cores, {system}, compiler {compiler}, with other work on the machine;
 {versions}; {measured}.
@@ -53,8 +54,8 @@ Measured on {processor}, {cores} cores, {system}, compiler {compiler}, with othe
 
 `sv.simulate` follows from this: each instant solved where nothing is integrated; else the Taylor method. DOP853, which
 needs no compiler, takes its place with poles, which series exclude, and where the rates have more than 300 operations,
-as making a series takes seconds. Both give way to Radau IIA where stability limits their steps, and where more than 50
-steps are to come that are not compiled, which the run's message then says; not where its own code has so many
+as making a series takes seconds. Both give way to Radau IIA where stability limits their steps, and where more than
+400 steps are to come that are not compiled, which the run's message then says; not where its own code has so many
 operations that compiling it would take longer. `accuracy=1e-6` adds projection and a tolerance that is lowered until
 two motions agree to the accuracy.
 

@@ -356,8 +356,8 @@ class Automatic(Taylor):
     @property
     def without_series(self):
         """What goes on where the equations are no series; None for an order that is required."""
-        suits = self.jets is not None or self.order is not None
-        return None if suits else AutomaticAdaptive(rtol=self.rtol, atol=self.atol)
+        required = self.jets is not None or self.order is not None
+        return None if required else AutomaticAdaptive(rtol=self.rtol, atol=self.atol)
 
 
 @frozen(repr=False)

@@ -35,8 +35,7 @@ from servoctl.values import frozen
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
 INSIDE = np.array([0.07, 0.19, 0.34, 0.53, 0.71, 0.86, 0.98])  # parts of a step at which its series is checked
 FAR_OFF = 30.0  # times the tolerance, which the equations may add to a series over its step
-STIFF_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
-MANY_STEPS = STIFF_STEPS // 8  # the same of steps in Python, which take eight times as long
+MANY_STEPS = 400  # of this length in the span, from which compiling an implicit method pays
 LIMITED = 1.2  # times the longest stable steps: more of them are taken where accuracy limits them, not stability
 MOST_DOUBTED = 50  # times that series did not meet the equations, after which they do not suit a motion
 OF_PIECE = ca.SX.sym("t_of_piece")  # the instant that selects pieces of paths
@@ -307,9 +306,9 @@ class Unsuited(Exception):
 def leave_if_unsuited(steps, method, limit, t, x, interpreted):
     """Leave a motion to a method that suits it better, after steps with ends t (S + 1,) [s], which lead to x (n_x,).
 
-    That is where stability limits them, or where many are to come that are not compiled; not to RadauIIA where its code
-    has more operations than steps are to come, which takes longer to compile. A motion that stays says that stability
-    limits its steps.
+    That is where stability limits them, or where the span takes many steps that are not compiled. A Jacobian that is
+    long to compile is compiled only where stability asks for it, and the span takes more steps than it has operations.
+    A motion that stays says that stability limits its steps. Pieces between switches have models of their own.
     """
     told = "stability" in steps.motion.note or steps.method not in ("Taylor", *EXPLICIT)
     if method is None and told:
@@ -335,7 +334,7 @@ def stiff(model, t, x, p, steps, span, limit):
 
     They lead to states x (n_x, N) at t (N,), with parameters p (n_p, N). A series of order p has a limit of about p/e.
     """
-    many, result = np.flatnonzero(abs(span) >= STIFF_STEPS * steps), np.zeros(len(steps), dtype=bool)
+    many, result = np.flatnonzero(abs(span) >= MANY_STEPS * steps), np.zeros(len(steps), dtype=bool)
     jacobians = model.function("ode_jacobian").grid(t[many], x[:, many], p[:, many]).T.reshape(-1, len(x), len(x))
     known = np.isfinite(jacobians).all(axis=(1, 2))
     modes = np.linalg.eigvals(jacobians[known]) * np.sign(span)

@@ -198,8 +198,8 @@ class TradeOff(Study):
         kind = "model" if len(self.meta["models"]) > 1 else "method"
         best = sorted((good.where(**{kind: name})._errors("error").min(), name) for name in set(good[kind].tolist()))
         alone = len(best) > 1 and f"{best[1][0]:.0e}" != f"{best[0][0]:.0e}"
-        only = f"; below {best[1][0]:.0e} only {best[0][1]}" if alone else ""
-        return f"{_in_words(row)}: {max(row['error'], self.uncertainty):.0e} for {1e3 * row['seconds']:.2g} ms{only}"
+        only = f"; of these rows, below {best[1][0]:.0e} only {best[0][1]}" if alone else ""
+        return f"{_in_words(row)}: {max(row['error'], self.uncertainty):.0e} for {1e3 * row['seconds']:.3g} ms{only}"
 
     def __repr__(self):
         t0, t1 = self.meta["t_span"]
@@ -354,7 +354,8 @@ def _failure(error):
 
 def _measure(ladders, comparison, budget, bar):
     """Measure settings within a budget [s of CPU], the one that needs least before all others; tells of Ctrl-C."""
-    waiting = sorted(ladders, key=lambda each: each.method in OF_MODELS)  # to make these takes longest
+    # first what needs no code of its own, then what takes ever longer to make
+    waiting = sorted(ladders, key=lambda each: [*METHODS].index(each.method), reverse=True)
     left, end = budget, cpu_seconds() + budget
     try:
         while waiting:
@@ -368,18 +369,18 @@ def _measure(ladders, comparison, budget, bar):
     except KeyboardInterrupt:
         return "interrupted"
     for ladder in waiting:
-        ladder.leave(
-            f"Budget: {ladder.needed:.2g} s of CPU are needed, {max(left, 0):.2g} of {budget:g} s were left.",
-            len(ladder.settings),
-        )
+        needs = f"{ladder.needed:.2g} s of CPU are needed" if ladder.needed else "not begun"
+        reason = f"Budget: {needs}, {max(left, 0):.2g} of {budget:g} s were left."
+        ladder.leave(reason, len(ladder.settings))
     return ""
 
 
 class Ladder:
     """The settings of a method and a treatment of drift that are still to be measured, and the rows of the others.
 
-    `needed` is the processor time that the next row is expected to need: that of the last one [s]; `unseen` is the
-    number of settings left out, as a coarser one reaches the uncertainty of the reference.
+    `needed` is the processor time that the next row is expected to need: that of the last one [s], or nothing yet where
+    that was the first, for which code was made; `unseen` is the number of settings left out, as a coarser one reaches
+    the uncertainty of the reference.
     """
 
     def __init__(self, model, motion, method, treatment, settings):
@@ -400,9 +401,11 @@ class Ladder:
                 finer = isinstance(error, SpecificationError) or needed is not None and self.rows
                 self.leave(_failure(error), len(self.settings) if finer else 1)
             return
+        if not np.isfinite([row[name] for name in ("error", "residual", "energy")]).all():
+            return self.leave(f"Diverged: the error of the motion is {row['error']:.1g}.", 1)
         row["resolved"] = row["integration"] >= comparison.agreement["error"]
         self.rows.append(self.same | row | {"value": self.settings.pop(), "failure": ""})
-        self.needed = cpu_seconds() - began
+        self.needed = cpu_seconds() - began if len(self.rows) > 1 else 0.0
         if not row["resolved"]:  # what is finer has no smaller error that could be seen
             self.unseen, self.settings = len(self.settings), []
 
@@ -420,7 +423,8 @@ def _rows(ladders):
         first, *others = failed
         drift = first["drift"] if len({row["drift"] for row in failed}) == 1 else ""
         also = (f"{row['drift']} {row['value']:g}: {row['failure'].partition(':')[0]}" for row in others)
-        failed = [first | {"drift": drift, "value": np.nan, "failure": f"{first['failure']} Also {'; '.join(also)}."}]
+        reasons = f"{first['failure']} So at {first['drift']} {first['value']:g}; also {'; '.join(also)}."
+        failed = [first | {"drift": drift, "value": np.nan, "failure": reasons}]
     return [*(row for ladder in ladders for row in ladder.rows), *failed]
 
 
