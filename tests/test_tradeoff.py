@@ -157,7 +157,7 @@ def test_what_needs_least_is_measured_first_and_what_does_not_fit_says_so(scene,
     assert study.where(method="RK4")["value"].tolist() == list(STEPS), "what was cut has a longer run later"
     found, failed = study.where(method="DOP853").rows()
     assert found["value"] == 1e-6, "a coarse setting that gets lost says nothing about finer ones"
-    assert "LimitExceeded: More than" in failed["failure"] and "Also none 1e-09" in failed["failure"]
+    assert "LimitExceeded: More than" in failed["failure"] and "also none 1e-09" in failed["failure"]
 
 
 def test_a_budget_that_suffices_for_nothing_says_so(scene):

@@ -349,6 +349,7 @@ class TaylorSteps(Stepping):
     With atol (n_x,) in place of a number, entries of a level are compared in their own tolerances.
     """
 
+    most = 100  # steps per call of the loop
     rank_lost = "the radius of convergence shrinks to nothing"
     advice = "Check whether the motion escapes or meets a point where it is not smooth."
 
@@ -363,8 +364,8 @@ class TaylorSteps(Stepping):
         self.model, self.n_x, self.p = model, len(model.state_names), np.append(model.p, np.nan)
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
-        self.long = self.f.operations > TAYLOR_COMPILED
-        self.most = AT_ONCE if self.long else 100  # steps per call of the loop
+        if self.f.operations > TAYLOR_COMPILED:
+            self.most = AT_ONCE
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
@@ -472,7 +473,7 @@ class TaylorSteps(Stepping):
             self.progress(a)
             if steps == self.most:
                 order, method = self.last - self.top + 1, getattr(self.settings, "for_stiff", None)
-                leave_if_unsuited(self, method, order / np.e, t, x, self.long)
+                leave_if_unsuited(self, method, order / np.e, t, x, self.most == AT_ONCE)
             if not fine:
                 self._follow(outcome)
             elif failed:
