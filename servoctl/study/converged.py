@@ -19,7 +19,7 @@ from servoctl.verification import verify
 
 INSTANTS = 51  # samples of adaptive methods while they are timed
 COMPARED, BETWEEN = 400, 0.382  # instants at which motions are compared, and where in its interval each lies
-EXACT = (  # what a motion converges to, tried in this order: two that end, the implicit ones where it is stiff
+TO_CONVERGE = (  # what a motion converges to, tried in this order: two that end, the implicit ones where it is stiff
     *(Taylor(16, rtol=1e-15, atol=1e-15), Adaptive("DOP853", 3e-14, 1e-15), Adaptive("LSODA", 1e-13, 1e-15)),
     *(RadauIIA(13, rtol=1e-14, atol=1e-15), RadauIIA(9, rtol=1e-13, atol=1e-14), Taylor(12, rtol=1e-14, atol=1e-14)),
 )
@@ -29,7 +29,7 @@ FIRST = 0.3  # s of CPU after which a run for the reference waits until the othe
 class Converged:
     """The converged motion of a model, at any instants, and the run `check` at `times` of a method that verifies it.
 
-    Both are of the methods `EXACT` that need the least time, or of Newton's method where nothing is integrated; `cpu`
+    Both are of the methods `TO_CONVERGE` that need the least time, or of Newton's method where nothing is integrated; `cpu`
     is the processor time of all that was tried [s].
     """
 
@@ -60,7 +60,7 @@ class Converged:
         made first, as many times as there are states, as their Jacobian has so many columns.
         """
         series_pay = isinstance(default_method(self.model, None), Taylor)
-        waiting = dict.fromkeys(sorted(EXACT, key=lambda each: isinstance(each, Taylor) and not series_pay), 0.0)
+        waiting = dict.fromkeys(sorted(TO_CONVERGE, key=lambda each: isinstance(each, Taylor) and not series_pay), 0.0)
         dearest, failures = 0.0, []
         while len(found) < 2:
             if not waiting or len(failures) > 1 and not found:  # two methods say where it ends
