@@ -29,8 +29,8 @@ FIRST = 0.3  # s of CPU after which a run for the reference waits until the othe
 class Converged:
     """The converged motion of a model, at any instants, and the run `check` at `times` of a method that verifies it.
 
-    Both are of the methods `TO_CONVERGE` that need the least time, or of Newton's method where nothing is integrated; `cpu`
-    is the processor time of all that was tried [s].
+    Both are of the methods `TO_CONVERGE` that need the least time, or of Newton's method where nothing is integrated;
+    `cpu` is the processor time of all that was tried [s].
     """
 
     def __init__(self, model, start, span, bar):
