@@ -93,8 +93,9 @@ def simulate(
         A method with its settings, such as `sv.methods.Taylor(jets=3)` or `sv.methods.RungeKutta(4, step=1e-3)`, or the
         short form of a method with its defaults: "algebraic", "Taylor", "RadauIIA", "RK4", "RK8", or scipy's names.
         Default: "algebraic" (a Newton solve at each instant) if the program determines the motion completely,
-        Σ o_a = 0, else "Taylor", or "RadauIIA" where stability limits its steps; "DOP853" with the treatments of drift
-        that series exclude, and for equations so large that making a series takes seconds.
+        Σ o_a = 0, else "Taylor"; "DOP853" with the treatments of drift that series exclude, and for equations so large
+        that making a series takes seconds; "RadauIIA" in place of both where stability limits their steps, or where the
+        span takes more than 400 that are not compiled.
     drift : None, "project", float, `sv.methods.Project(...)` or `sv.methods.Poles(...)`, optional
         Treatment of constraint drift. A number is the time constant of the error dynamics [s].
     accuracy : float, optional
