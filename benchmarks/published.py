@@ -14,7 +14,6 @@ rates X', as the pivots at the start give them.
 """
 
 import argparse
-import os
 import statistics
 import time
 import warnings
@@ -29,6 +28,7 @@ from scipy.special import ellipj
 
 import servoctl as sv
 from servoctl.plants.driven import driven
+from servoctl.study.converged import cpu_seconds
 
 G = 9.81  # m/s^2
 
@@ -542,11 +542,6 @@ STEPS = (500, 2000, 8000, 32000)  # of RK8
 ONE_AS_GOOD = 0.3  # digits, by which another setting may be worse and counts as good
 
 
-def cpu():
-    """CPU s of this process and of those that it has waited for, such as compilers."""
-    return sum(os.times()[:4])
-
-
 def settings(problem):
     """The default, and own methods by name with their settings: a list of (label, method)."""
     ladder = [("default", None)]
@@ -575,10 +570,10 @@ def peers(problem, model, start):
     f, names, p, until = model.function("ode"), list(model.state_names), model.p, problem.until
 
     def call(method, rtol):
-        latest = cpu() + PATIENCE
+        latest = cpu_seconds() + PATIENCE
 
         def rates(t, x):
-            if cpu() > latest:
+            if cpu_seconds() > latest:
                 raise TimeoutError(f"more than {PATIENCE:g} CPU s until t = {t:.2g} s")
             return f(t, x, p)[: len(x0)]
 
@@ -592,12 +587,12 @@ def peers(problem, model, start):
 
 def timed(call, problem):
     """Digits, median CPU s, CPU s of the first call, and what was said; None for digits where a call fails."""
-    began = cpu()
+    began = cpu_seconds()
     try:
         values, message = call()
     except Exception as error:
-        return None, cpu() - began, cpu() - began, f"{type(error).__name__}: {error}"
-    first, samples = cpu() - began, []
+        return None, cpu_seconds() - began, cpu_seconds() - began, f"{type(error).__name__}: {error}"
+    first, samples = cpu_seconds() - began, []
     while len(samples) < REPEATS and sum(samples) < ENOUGH and first < 30.0:
         began = time.process_time()
         call()
@@ -607,9 +602,10 @@ def timed(call, problem):
 
 def measure(name, with_peers):
     """Print the table of one problem, and the default beside the best of the others at its error."""
-    problem, began = PROBLEMS[name], cpu()
+    problem, began = PROBLEMS[name], cpu_seconds()
     model, start = prepared(problem)
-    print(f"\n{name} ({problem.source}), t = {problem.until:g} s; derived in {cpu() - began:.2f} CPU s", flush=True)
+    derived = cpu_seconds() - began
+    print(f"\n{name} ({problem.source}), t = {problem.until:g} s; derived in {derived:.2f} CPU s", flush=True)
     print("| method | digits | CPU s | first | |\n|---|---|---|---|---|", flush=True)
     calls = [(label, ours(problem, model, start, method)) for label, method in settings(problem)]
     found = {}
