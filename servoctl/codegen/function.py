@@ -82,7 +82,7 @@ class Compiled:
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self.others, self.sizes)
         # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
-        travels = self.loops and "_library" not in vars(self) and not self._too_long and compiler.compiler() is not None
+        travels = self.loops and "_library" not in vars(self) and not self.too_long and compiler.compiler() is not None
         text = self.source() if travels else ""
         state = {"_text": text or None}
         return Compiled, parts, state | ({"operations": self.operations} if self.loops else {})
@@ -309,7 +309,7 @@ class Compiled:
             )
 
     @property
-    def _too_long(self):
+    def too_long(self):
         """Whether compiling takes as long as all steps of a motion."""
         return "taylor" in self.loops and self.operations > TAYLOR_COMPILED
 
@@ -318,7 +318,7 @@ class Compiled:
         """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
         if (found := vars(self).get("_library")) is not None:
             return found
-        return self._interpreter if self._too_long else self._loaded("_library", self.source, lambda: self._level)
+        return self._interpreter if self.too_long else self._loaded("_library", self.source, lambda: self._level)
 
     @property
     def _lanes(self):

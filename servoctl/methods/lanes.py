@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.function import TAYLOR_COMPILED, compiled
+from servoctl.codegen.function import compiled
 from servoctl.codegen.native import pointer
 from servoctl.codegen.paths import combined
 from servoctl.jets.branches import steep_arguments
@@ -99,13 +99,13 @@ def integrate(model, last, span, cases, rtol, times, threads=None, progress=None
     """Integrate from starts x0 (N, n_x) with parameters p (N, n_p) and absolute tolerances (N,) over a span.
 
     Ctrl-C ends it. Returns ends (N, 4 + 2 n_x), samples (N, K, n_x) at the times (K,), and whether Ctrl-C came; the
-    arrays are None without a compiler or beyond `TAYLOR_COMPILED` operations. An end has the outcome (1: finished, 0:
-    not reached before Ctrl-C, else to be computed by itself), number of steps, last instant, largest violation of the
+    arrays are None without a compiler or where the series is `too_long`. An end has the outcome (1: finished, 0: not
+    reached before Ctrl-C, else to be computed by itself), number of steps, last instant, largest violation of the
     invariants at start and end (relative to their gradients times the state), last state, and largest sizes of the
     state, `from_start`. `progress` is called with the number of cases begun.
     """
     f = series_loop(model, last)
-    library = None if f.operations > TAYLOR_COMPILED else _library(f, model)
+    library = None if f.too_long else _library(f, model)
     if library is None:
         return None, None, False
     x0, p, atol = cases

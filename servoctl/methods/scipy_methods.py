@@ -84,8 +84,9 @@ class ScipySteps(BulkSteps):
             t.append(b if solver.t == solver.t_bound else solver.t)
             x.append(solver.y.copy())
         self._count(len(z))
-        if 4 * len(z) >= AT_ONCE:  # 1.0: a mode that decays within each step
-            leave_if_unsuited(self, self.for_stiff, 1.0, np.array(t), x[-1], True)
+        if 4 * len(z) >= AT_ONCE:  # blocks from the third on, after seven steps; the limit is that of a mode that
+            # decays within each of them
+            leave_if_unsuited(self, self.for_stiff, 1.0, np.array(t), x[-1], interpreted=True)
         self.most = min(2 * self.most, AT_ONCE)
         if not self.failure and self._creeps(len(z)):
             self.failure = "its steps shrink"

@@ -296,7 +296,7 @@ def _integrated_levels(free, n):
 
 
 class Unsuited(Exception):
-    """Series do not suit a motion, for which their settings name another method."""
+    """A default does not suit a motion, for which its settings name another method."""
 
     def __init__(self, why, method):
         super().__init__(why)
@@ -313,20 +313,21 @@ def leave_if_unsuited(steps, method, limit, t, x, interpreted):
     told = "stability" in steps.motion.note or steps.method not in ("Taylor", *EXPLICIT)
     if method is None and told:
         return
-    length, p = abs(t[-1] - t[0]) / (len(t) - 1), steps.model.p
-    forward, mean = np.copysign(steps.length, t[-1] - t[0]), np.array([length])
-    compiles = isinstance(method, RadauIIA) and steps.model.function("ode_jacobian").operations
-    long = compiles > TAYLOR_COMPILED
-    if stiff(steps.model, t[-1:], x[:, None], p[:, None], mean, forward, limit)[0]:
+    length = abs(t[-1] - t[0]) / (len(t) - 1)
+    like_last = steps.length / length
+    like_all = steps.motion.counters["steps"] * steps.length / abs(t[-1] - steps.span[0]) if interpreted else 0.0
+    if max(like_last, like_all) < MANY_STEPS:
+        return
+    operations = steps.model.function("ode_jacobian").operations if isinstance(method, RadauIIA) else 0
+    last = t[-1:], x[:, None], steps.model.p[:, None], np.array([length])
+    if stiff(steps.model, *last, np.copysign(steps.length, t[-1] - t[0]), limit)[0]:
         why = f"stability, not accuracy, limits the steps of {steps.method} to {abs(t[-1] - t[-2]):.2g} s"
-        if method is not None and not (long and steps.length < compiles * length):
+        if method is not None and (operations <= TAYLOR_COMPILED or like_last >= operations):
             raise Unsuited(why, method)
         if not told:
             steps.motion.say(f"{why}, and its forces may err by far: try method='RadauIIA'")
-    elif interpreted and compiles and not long and steps.family is None:
-        count = steps.motion.counters["steps"] * steps.length / abs(t[-1] - steps.span[0])
-        if count > MANY_STEPS:
-            raise Unsuited(f"its steps are compiled, and {steps.method} takes more than {MANY_STEPS} in Python", method)
+    elif like_all > MANY_STEPS and 0 < operations <= TAYLOR_COMPILED and steps.family is None:
+        raise Unsuited(f"its steps are compiled, and {steps.method} takes more than {MANY_STEPS} in Python", method)
 
 
 def stiff(model, t, x, p, steps, span, limit):
@@ -364,8 +365,7 @@ class TaylorSteps(Stepping):
         self.model, self.n_x, self.p = model, len(model.state_names), np.append(model.p, np.nan)
         self.last = last = last_index(model, self.settings)
         self.f, self.rates = series_loop(model, last), model.function("ode")
-        if self.f.operations > TAYLOR_COMPILED:
-            self.most = AT_ONCE
+        self.most = AT_ONCE if self.f.too_long else type(self).most
         self.nq, self.n, self.top = model.nq, model.n, model.reduction.top
         self.plain = model.reduction.mechanism.q.plain
         self.n_c = (0 if self.plain else self.nq * last) + self.n * last
@@ -473,7 +473,7 @@ class TaylorSteps(Stepping):
             self.progress(a)
             if steps == self.most:
                 order, method = self.last - self.top + 1, getattr(self.settings, "for_stiff", None)
-                leave_if_unsuited(self, method, order / np.e, t, x, self.most == AT_ONCE)
+                leave_if_unsuited(self, method, order / np.e, t, x, interpreted=self.f.too_long)
             if not fine:
                 self._follow(outcome)
             elif failed:
