@@ -265,8 +265,8 @@ def test_a_particle_goes_round_and_round(kind, method, derived):
 
 def derives_again(patch):
     """Changed pivots are those of rows that are derived again, as where no others solve the same rows."""
-    patch.setattr("servoctl.methods.monitor.with_diagonal_pivots", lambda model: None)
-    patch.setattr("servoctl.methods.monitor.reordered_at", lambda *_: None)
+    patch.setattr("servoctl.methods.motion.with_diagonal_pivots", lambda model: None)
+    patch.setattr("servoctl.methods.motion.reordered_at", lambda *_: None)
 
 
 @pytest.mark.parametrize(("make", "method"), [("equation", "DOP853"), ("curvature", "Taylor")])
@@ -340,7 +340,7 @@ def test_where_no_other_pivots_are_found_the_motion_is_kept(method, derived, mon
     model = derived(led_round if method == "algebraic" else driven_pendulum)
     start = model.start(t=0.2, x=np.cos(0.4), y=np.sin(0.4))
     derives_again(monkeypatch)
-    monkeypatch.setattr("servoctl.methods.monitor.derived_near", none_found)
+    monkeypatch.setattr("servoctl.methods.motion.derived_near", none_found)
     settings = {} if method == "algebraic" else precise(method)
     with pytest.raises(sv.errors.SingularProgram) as caught:
         sv.simulate(model, start, (0.2, 4.0), as_method(method, **settings), t_eval=np.linspace(0.2, 4.0, 381))

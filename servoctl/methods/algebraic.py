@@ -7,9 +7,9 @@ ends. Samples are solved between the ends of these steps.
 import numpy as np
 
 from servoctl.jets.branches import Branches
-from servoctl.methods.monitor import Fine, Repivot, Singular, Stretch, strong
 from servoctl.methods.motion import Stepping, breakpoints, interruptible
 from servoctl.methods.pieces import DEFAULT, Tolerance
+from servoctl.methods.rank import Fine, Singular, Stretch, Weak, strong
 from servoctl.methods.switches import Switches
 from servoctl.model.pivots import pivot_sizes
 from servoctl.model.switching import switching
@@ -102,12 +102,13 @@ class _Algebraic(Stepping):
 
         Those of forces alone change the actuation, not the motion.
         """
+        self.tolerance = Tolerance(self.model, x, *DEFAULT)
         moves = self.model.once("switches of the motion", lambda: switched(self.model.reduction))
         self.family = switching(self.model) if moves else None
         if self.family is not None:
             branches = self.family.branches(t, x)
             self._use(self.family.at(branches))
-            self.switches = Switches(self.family, branches, self.length, 1, Tolerance(self.model, x, *DEFAULT))
+            self.switches = Switches(self.family, branches, self.length, 1, self.tolerance)
 
     def _advance(self, cuts, x):
         """Follow the solution as far as the pivots allow; the instant and the state from which it goes on."""
@@ -121,11 +122,11 @@ class _Algebraic(Stepping):
         states = np.concatenate([nodes[:, 1 : 1 + nq].T, rates])
         if self.motion.start is None:
             self.motion.start = states[:, 0]
-            self.monitor.begin(pivots[:, 0])
-        stretch = Stretch(t, states, pivots[:, 1:, None], self._top)
-        outcome = self.monitor.inspect(stretch)
-        last = self._resumption(t, outcome.steps) if isinstance(outcome, Repivot) else outcome.steps
-        switch = self._switch(stretch.first(last), nodes)
+            self.rank.begin(self.model, pivots[:, 0])
+        stretch = Stretch(t, states, pivots[:, 1:, None], self._between(nodes))
+        outcome = self.rank.inspect(stretch)
+        last = self._resumption(t, outcome.steps) if isinstance(outcome, Weak) else outcome.steps
+        switch = self._switch(stretch.first(last))
         if self.events is not None and self._meets_event(*self._reached(nodes, last, switch, outcome, cuts[-1])):
             return t[last], states[:, last]
         if switch is not None:
@@ -139,17 +140,22 @@ class _Algebraic(Stepping):
             self._fail(t[last], states[:, last], "Newton's method finds no solution of the program beyond")
         return t[last], states[:, last]
 
-    def _switch(self, stretch, nodes):
+    def _switch(self, stretch):
         """The first switch within steps between nodes, or None."""
         if self.switches is None or len(stretch.t) < 2:
             return None
+
+        self.switches.start = stretch.t[0]
+        return self.switches.first(stretch, stretch.dense, stretch.state)
+
+    def _between(self, nodes):
+        """States (n_x, N) from steps and times (N,) within them; NaN where there is no solution."""
 
         def states(_, times):
             found = self._states(self.f.newton(times, nodes, self.p)[0])
             return np.pad(found, ((0, 0), (0, len(times) - found.shape[1])), constant_values=np.nan)
 
-        self.switches.start = stretch.t[0]
-        return self.switches.first(stretch, states, lambda k, t: states(k, np.array([t]))[:, 0])
+        return states
 
     def _turned(self, switch, nodes, t1):
         """Go on beyond a switch, or stop there; its instant and the state."""
@@ -157,7 +163,7 @@ class _Algebraic(Stepping):
         if self.motion.stop is None:
             self._turn(switch, t1)
         if self.motion.stop is None:
-            self.monitor.begin(self._pivots(switch.t, switch.x))
+            self.rank.begin(self.model, self._pivots(switch.t, switch.x))
         return switch.t, switch.x
 
     def _resumption(self, t, last):

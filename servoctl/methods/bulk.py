@@ -7,11 +7,12 @@ one that does not meet them count; the next one ends at that instant, so that it
 
 import numpy as np
 
-from servoctl.methods.monitor import FRACTIONS, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import Stepping
 from servoctl.methods.pieces import RESOLUTION, End, net
+from servoctl.methods.rank import Fine, Stretch, Weak
 from servoctl.values import frozen
 
+QUARTERS = 4  # of a step, at whose ends pivots are inspected
 OFF = 1e3  # times the tolerance, which the equations may add to a step
 REPEATS = 8  # of a step at one instant, after which it is believed
 FUTILE = 1e-8  # of the span: a shorter step that misses the equations where the rank is lost ends the motion
@@ -54,7 +55,7 @@ class BulkSteps(Stepping):
                 self._turn(outcome, b)
                 return outcome.t, outcome.x
             # A step in which a pivot vanishes is sampled with the next pivots: its own lose digits near the zero.
-            before = max(last - 1, 0) if isinstance(outcome, Repivot) else last
+            before = max(last - 1, 0) if isinstance(outcome, Weak) else last
             self._record(steps, 0, before)
             t, x = steps.t[last], steps.x[:, last].copy()
             if last < len(steps.t) - 1:
@@ -63,7 +64,7 @@ class BulkSteps(Stepping):
             if before < last:
                 self._record(steps, before, last)
             self.progress(t)
-            futile = doubt is not None and abs(doubt - t) < FUTILE * self.length and self.monitor.lost(t, x)
+            futile = doubt is not None and abs(doubt - t) < FUTILE * self.length and self.rank.lost(t, x)
             if isinstance(outcome, Fine) and (futile or steps.failed and last == len(steps.t) - 1):
                 self._fail(t, x, self.failure)
                 goes_on = False
@@ -89,24 +90,16 @@ class BulkSteps(Stepping):
         """Go on from before a step of length h [s], which is repeated."""
 
     def _stretch(self, steps):
-        """The steps for the monitor: they have passed their error test, and the next begin where they end."""
-        k, at, quarters = net(steps.t, self.length / RESOLUTION, len(FRACTIONS) + 1)
+        """The steps to be inspected: they have passed their error test, and the next begin where they end."""
+        k, at, quarters = net(steps.t, self.length / RESOLUTION, QUARTERS)
         states = steps.at(k, at)
         y = self.f.grid(at, states, self.p)
         self.net = k, at, states, y[: self.n_x]
         pivots = y[self.n_x :, quarters]
         if len(pivots):
             self.motion.count(watched=pivots.shape[1])
-        return DenseStretch(
-            steps.t,
-            steps.x,
-            pivots.reshape(len(pivots), len(steps.t) - 1, len(FRACTIONS) + 1),
-            self._top,
-            crosses=True,
-            dense=steps.at,
-            pivots_at=self._pivots,
-            slope=steps.slope,
-        )
+        pivots = pivots.reshape(len(pivots), len(steps.t) - 1, QUARTERS)
+        return Stretch(steps.t, steps.x, pivots, steps.at, crosses=True, slope=steps.slope)
 
     def _doubted(self, stretch):
         """The number of steps that meet the equations, and the instant at which the next one does not, or None."""

@@ -15,8 +15,8 @@ from servoctl.codegen.native import pointer
 from servoctl.codegen.paths import combined
 from servoctl.jets.branches import steep_arguments
 from servoctl.methods.algebraic import NODES, STEPS, switched
-from servoctl.methods.monitor import DEGRADED, NEGLIGIBLE
 from servoctl.methods.motion import breakpoints
+from servoctl.methods.rank import DEGRADED, NEGLIGIBLE
 from servoctl.methods.taylor import FAR_OFF, series_loop
 from servoctl.model.equations import invariant_names
 from servoctl.model.pivots import pivot_sizes

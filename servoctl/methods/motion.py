@@ -1,4 +1,4 @@
-"""What all integrations share: the pieces of a motion, and the change of pivots that the rank monitor requires."""
+"""What all integrations share: the pieces of a motion, and the change of pivots that weak pivots require."""
 
 import contextlib
 import threading
@@ -12,14 +12,16 @@ from servoctl.dense import Dense, steps_of
 from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.methods.choice import Poles
 from servoctl.methods.edges import Edges, edge
-from servoctl.methods.monitor import VANISHING, Fine, Monitor, Repivot, Singular
+from servoctl.methods.lost_rank import VANISHING, failed, singular
 from servoctl.methods.pieces import DEFAULT, End, Tolerance
+from servoctl.methods.rank import Fine, Rank, Singular, Weak
 from servoctl.methods.sizes import from_start
 from servoctl.methods.switches import Switches, no_model, sticks
 from servoctl.model.full import departure, other_order
-from servoctl.model.variants import derived_near
+from servoctl.model.variants import derived_near, reordered_at, with_diagonal_pivots
 
 CHATTERS, CHATTERS_IN = 100, 1e-3  # switches in this part of the span: the motion stays on one, as after ever less time
+NO_CHOICE = "no choice of pivots leads on"
 MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and as many as figures show
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
@@ -236,7 +238,7 @@ def equal_steps(a, b, step):
 
 
 class Stepping:
-    """One integration: the model in use, the monitor of its pivots, and the motion so far.
+    """One integration: the model in use, the rank along it, and the motion so far.
 
     A method takes the steps of a smooth piece in `_piece(a, x, b, times)` and returns the instant and the state at its
     end, which lies before b where a switching function vanishes. If a step fails, `rank_lost` describes this for a
@@ -314,12 +316,12 @@ class Stepping:
 
     def _begin_piece(self, t, pivots):
         """Start a piece at t [s] with pivots (n_g,)."""
-        self.monitor.begin(pivots)
+        self.rank.begin(self.model, pivots)
         if self.switches is not None:
             self.switches.start = t
 
     def _inspected(self, stretch):
-        """The outcome of steps: that of the monitor, or the `End` of the piece if it comes first."""
+        """The outcome of steps: that of the rank, or the `End` of the piece if it comes first."""
         outcome = self._smooth(stretch)
         self.motion.reaches(from_start(self.model, stretch.x[:, : outcome.steps + 1], self.x0))
         return outcome if self.events is None else self._event(stretch, outcome) or outcome
@@ -328,7 +330,7 @@ class Stepping:
         """The `End` at a terminal event within steps before their outcome; None without."""
         end = stretch.t[outcome.steps] if isinstance(outcome, Fine) else outcome.t
         ends = np.append(stretch.t[: outcome.steps + 1], end)
-        dense = self._states_within(stretch)
+        dense = stretch.dense
 
         def jets_at(t):
             return self._with_top(t, dense(steps_of(stretch.t, t), t))
@@ -348,13 +350,13 @@ class Stepping:
         return np.concatenate([x, f.grid(t, x, p)[self.n_x - self.model.n : self.n_x]])
 
     def _smooth(self, stretch):
-        """The outcome of steps: that of the monitor, or the `End` of the smooth piece if it comes first."""
+        """The outcome of steps: that of the rank, or the `End` of the smooth piece if it comes first."""
         whole, switch = stretch, None
         if self.switches is not None:
-            switch = self.switches.first(stretch, self._states_within(stretch), self._state_within(stretch))
+            switch = self.switches.first(stretch, stretch.dense, self._state_within(stretch))
         if switch is not None:
             stretch = stretch.first(switch.steps)
-        outcome = self.monitor.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
+        outcome = self.rank.inspect(stretch) if len(stretch.t) > 1 else Fine(0)
         outcome = switch if switch is not None and isinstance(outcome, Fine) else outcome
         self.tolerance.accept(whole.x[:, : outcome.steps + 1])
         t = whole.t[: outcome.steps + 1]
@@ -362,13 +364,9 @@ class Stepping:
             t = np.append(t, outcome.t)
         return self.edges.first(self.model, t, lambda: self._continuous(whole)) or outcome
 
-    def _states_within(self, stretch):
-        """X (n_x, N) from steps (N,) and times (N,), where switches are looked for."""
-        return stretch.dense
-
     def _continuous(self, stretch):
         """X (n_x, N) from steps (N,) and times (N,), where edges are looked for: before its end is projected."""
-        return self._states_within(stretch)
+        return stretch.dense
 
     def _state_within(self, stretch):
         """X from (k, t) within steps, where ends of smooth pieces are located."""
@@ -408,15 +406,18 @@ class Stepping:
 
     def _start(self, t, x, b):
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
-        self.monitor = Monitor(self.model, t, x)
-        if self.monitor.bad_choice(*self._with_pivots(t, x)):
-            for same_rows in (True, False):  # whose rows may divide by a pivot that is zero there
-                variant = self.monitor.repivoted(t, x, self._top(t, x), same_rows)
-                if variant is not None:
-                    self._go_on(variant, t, x)
-                if not self.monitor.without_value(*self._with_pivots(t, x)):
-                    break
-            self.motion.stop = self.monitor.refuse_start(t, x, *self._with_pivots(t, x))
+        self.rank = Rank(self.model, t, x, self.tolerance)
+        outputs, pivots = self._with_pivots(t, x)
+        self.rank.begin(self.model, pivots)
+        if self.rank.bad_choice(outputs, pivots):
+            for derive in (False, True):  # rows may divide by a pivot that is zero there
+                self._repivot(t, x, derive)
+                outputs, pivots = self._with_pivots(t, x)
+                if not self.rank.without_value(outputs, pivots):
+                    return
+            finite, weakest = np.all(np.isfinite(outputs)), self.rank.weakest(pivots)
+            why = f"a pivot is {weakest:.1e} of its size nearby" if finite else "the accelerations are not finite there"
+            self.motion.stop = singular(self.rank, t, x, why)
 
     def _outputs(self, t, x):
         return self.f(t, x, self.p)
@@ -436,25 +437,32 @@ class Stepping:
         """γ^(s̄) at a state."""
         return self._outputs(t, x)[self.n_x - self.model.n : self.n_x]
 
-    def _go_on(self, variant, t, x):
-        model, self.monitor = variant
+    def _repivot(self, t, x, derive):
+        """Go on from a state with other pivots of the same rows, or of rows that are derived there; False without."""
+        jets = np.append(x, np.nan_to_num(self._top(t, x)))
+        model = None if derive else with_diagonal_pivots(self.model) or reordered_at(self.model, t, jets)
+        same = model is not None
+        if not same:
+            try:
+                sizes = zip(self.model.state_names, self.rank.largest, strict=True)
+                model = derived_near(self.model, t, jets, {name: size for name, size in sizes if size > 0})
+            except ServoError:
+                return False
         self._use(model)
-        self.monitor.begin(self._pivots(t, x))
+        self.rank = self.rank if same else Rank(model, t, x, self.tolerance)
+        self.rank.go_on(model, self._pivots(t, x), t, x)
         self.motion.count(pivot_changes=1)
+        return True
 
     def _follow(self, outcome):
         """Go on with other pivots if the outcome requires them; False if the program is singular."""
-        if isinstance(outcome, Repivot):
-            t, x = outcome.t, outcome.x
-            variant, tried = None, self.motion.changes_pivots(t)
-            if tried < MOST_CHANGES:
-                variant = outcome.variant or self.monitor.repivoted(t, x, self._top(t, x), same_rows=not tried)
-            if variant is not None:
-                self._go_on(variant, t, x)
+        at, why = (outcome.at, outcome.why) if isinstance(outcome, Singular) else (outcome.t, NO_CHOICE)
+        if isinstance(outcome, Weak):
+            tried = self.motion.changes_pivots(outcome.t)
+            if tried < MOST_CHANGES and self._repivot(outcome.t, outcome.x, derive=tried > 0):
                 return True
-            outcome = outcome.otherwise
         stop = self.edges and self.edges.stopped(self.model, outcome.t)
-        self.motion.end_after(outcome.t, stop or self.monitor.singular(outcome.t, outcome.x, outcome.why))
+        self.motion.end_after(outcome.t, stop or singular(self.rank, at, outcome.x, why))
         return False
 
     def _fail(self, t, x, why):
@@ -462,9 +470,9 @@ class Stepping:
         place, row = edge(self.model, t, x)
         why = "; ".join(dict.fromkeys(filter(None, (*why.split("; "), place))))
         what = f"{self.method} stopped at t = {t:.7g} s: {why}"
-        self.motion.stop = self.monitor.failed(t, x, self.rank_lost, (what, self.advice), row)
+        self.motion.stop = failed(self.rank, t, x, self.rank_lost, (what, self.advice), row)
 
     def _keep_last(self, t, x):
         """Record the last state, unless it is so near a singularity that γ^(s̄) is lost."""
-        if self.monitor.rank_measure(t, x) > VANISHING:
+        if self.rank.measure(t, x) > VANISHING:
             self.motion.add(self.model, [t], x[:, None], self._top(t, x)[:, None])

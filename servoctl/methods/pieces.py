@@ -67,7 +67,11 @@ class Tolerance:
 
     def of(self, slopes, x):
         """Tolerances (m, N) of functions with derivatives (m, n_x, N) in X = x (n_x, N) along the motion."""
-        return np.einsum("mxn,xn->mn", np.abs(slopes), self.atol + self.rtol * self._sizes(x))
+        return np.einsum("mxn,xn->mn", np.abs(slopes), self.states(x))
+
+    def states(self, x):
+        """Tolerances (n_x, N) of states x (n_x, N) along the motion."""
+        return self.atol + self.rtol * self._sizes(x)
 
     def accept(self, x):
         """Take in states (n_x, N) as part of the motion."""

@@ -6,9 +6,9 @@ import numpy as np
 
 from servoctl.dense import Hermite
 from servoctl.methods.choice import Poles, Project
-from servoctl.methods.monitor import Fine, Stretch
 from servoctl.methods.motion import Stepping, equal_steps
 from servoctl.methods.pieces import LEAVES, End, residuals, terms_of
+from servoctl.methods.rank import Fine, Stretch
 
 MUCH = 1e-2  # of its terms, by which a residual may change over a step, unless shorter ones change it less
 FINER, CLOSER = 16, 4  # shorter steps in place of one; how often, to come close to where a motion ends
@@ -91,7 +91,7 @@ class RungeKuttaSteps(Stepping):
             return None
         for k in np.flatnonzero(self._off(t, states)):
             at, x = self._last(t[k], states[:, k], t[k + 1] - t[k])
-            if self.monitor.lost(at, x):
+            if self.rank.lost(at, x):
                 return int(k), at, x
         return None
 
@@ -140,18 +140,23 @@ class RungeKuttaSteps(Stepping):
         return self.f.rk(t, x, h, count, self.p, self.tableau, 1, self.every)[1:]
 
     def _inspect(self, t, states, pivots):
-        """The monitor's outcome; a step across a pivot's zero has passed no error test and is repeated."""
-        return self._inspected(Stretch(t, states, pivots[:, 1:, None], self._top))
+        """The outcome of steps; one across a pivot's zero has passed no error test and is repeated."""
+        return self._inspected(Stretch(t, states, pivots[:, 1:, None], self._between(t, states)))
 
-    def _states_within(self, stretch):
+    def _between(self, t, states):
         """X from steps and times within them, by polynomials through all derivatives."""
-        dense = Hermite(self.model, stretch.t, self._jets(stretch.t, stretch.x))
-        return lambda k, t: dense(k, t, self.p)[: self.n_x]
+        made = []
+
+        def dense(k, times):
+            made[:] = made or [Hermite(self.model, t, self._jets(t, states))]
+            return made[0](k, times, self.p)[: self.n_x]
+
+        return dense
 
     def _continuous(self, stretch):
-        """As `_states_within`; where steps are projected, by shorter ones from their starts that are not."""
+        """Where steps are projected, by shorter ones from their starts that are not."""
         if not self.every:
-            return self._states_within(stretch)
+            return stretch.dense
 
         def states(k, t):
             places = zip(stretch.t[k], stretch.x[:, k].T, t, strict=True)

@@ -22,9 +22,9 @@ from servoctl.jets.series import Motion, Series, is_zero, over, shifted
 from servoctl.methods.choice import EXPLICIT, Project, RadauIIA
 from servoctl.methods.edges import Edges
 from servoctl.methods.independent import in_independent, solved_for
-from servoctl.methods.monitor import DEGRADED, DenseStretch, Fine, Repivot
 from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interruptible, margin_at
 from servoctl.methods.pieces import AT_ONCE, RESOLUTION, End, Tolerance, net
+from servoctl.methods.rank import DEGRADED, Fine, Stretch, Weak
 from servoctl.methods.sizes import from_start
 from servoctl.model.equations import invariant_names, monitored_rows
 from servoctl.model.pivots import pivot_sizes
@@ -468,7 +468,7 @@ class TaylorSteps(Stepping):
             if isinstance(outcome, End):
                 self._turn(outcome, b)
                 return outcome.t, outcome.x
-            go_on = isinstance(outcome, Repivot)
+            go_on = isinstance(outcome, Weak)
             a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
             self.progress(a)
             if steps == self.most:
@@ -549,18 +549,10 @@ class TaylorSteps(Stepping):
         return k[within], at[within]
 
     def _stretch(self, log):
-        """The steps for the monitor; pivots inside them cost a series each, so only suspicious steps evaluate them."""
+        """The steps to be inspected, with the pivots at their ends."""
         t, states, pivots = log.t, log.states, log.outputs[self.n_c :]
         ends = np.column_stack([pivots[:, 1:], self._pivots(t[-1], states[:, -1])]) if len(t) > 1 else pivots
-        return DenseStretch(
-            t,
-            states,
-            ends[:, :, None],
-            self._top,
-            dense=lambda k, s: log.jets(k, s, self.top - 1),
-            pivots_at=self._pivots,
-            resumes=True,
-        )
+        return Stretch(t, states, ends[:, :, None], lambda k, s: log.jets(k, s, self.top - 1), crosses=True)
 
     def _sample(self, log, pending, end):
         """Keep the steps, record the pending samples up to `end` and return those that remain."""

@@ -1,4 +1,4 @@
-"""The monitor of pivots: what it says of quiet steps, of badly chosen pivots and of a lost rank."""
+"""The rank along motions: quiet steps, badly chosen pivots, and ranks that are lost."""
 
 import casadi as ca
 import closed_forms as cf
@@ -9,7 +9,9 @@ from scipy.integrate import solve_ivp
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.bulk import BulkSteps
-from servoctl.methods.monitor import DEGRADED, NO_CHOICE, DenseStretch, Fine, Monitor, Repivot, Singular, Stretch
+from servoctl.methods.lost_rank import singular
+from servoctl.methods.pieces import DEFAULT, Tolerance
+from servoctl.methods.rank import DEGRADED, Fine, Rank, Singular, Stretch, Weak
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +33,24 @@ def round_the_circle(t):
     return np.array([np.cos(t), np.sin(t), -np.sin(t), np.cos(t)])
 
 
+def rank_from(model, t, x):
+    return Rank(model, t, x, Tolerance(model, x, *DEFAULT))
+
+
 def begun(model, t, x):
-    monitor = Monitor(model, t, x)
-    monitor.begin(functions(model)[0](t, x))
-    return monitor
+    rank = rank_from(model, t, x)
+    rank.begin(model, functions(model)[0](t, x))
+    return rank
 
 
-def sampled(model, t, x, **options):
-    pivots, top = functions(model)
-    values = np.array([pivots(s, column) for s, column in zip(t[1:], x.T[1:], strict=True)]).T
-    return Stretch(t, x, values[:, :, None], top, **options)
+def linear(t, x):
+    """States between samples, linearly."""
+    return lambda k, s: x[:, k] + (s - t[k]) / (t[k + 1] - t[k]) * (x[:, k + 1] - x[:, k])
+
+
+def sampled(model, t, x, dense=None, **options):
+    values = np.array([functions(model)[0](s, column) for s, column in zip(t[1:], x.T[1:], strict=True)]).T
+    return Stretch(t, x, values[:, :, None], dense or linear(t, x), **options)
 
 
 def test_a_program_that_is_singular_at_its_start_says_by_how_much():
@@ -51,63 +61,51 @@ def test_a_program_that_is_singular_at_its_start_says_by_how_much():
     model = sv.derive(mechanism, sv.Program({"a": x - 0.1 * q.t**2}), guess={"y": 0.4})
     state = np.zeros(len(model.state_names))
     state[model.state_names.index("y")] = 0.4
-    monitor = Monitor(model, 0.0, state)
-    error = monitor.singular(0.0, state, "its lever is zero")
-    assert monitor.rank_measure(0.0, state) < 1e-9 and error.details["measure"] < 1e-9
+    rank = rank_from(model, 0.0, state)
+    error = singular(rank, 0.0, state, "its lever is zero")
+    assert rank.measure(0.0, state) < 1e-9 and error.details["measure"] < 1e-9
     assert "from the first instant on" in str(error) and "1.0e+00" not in str(error)
 
 
 def test_quiet_steps_are_fine(circle):
     t = np.linspace(0.0, 0.7, 15)
     assert begun(circle, 0.0, round_the_circle(0.0)).inspect(sampled(circle, t, round_the_circle(t))) == Fine(14)
-    none = Stretch(t[:1], round_the_circle(t[:1]), np.zeros((1, 0, 1)), functions(circle)[1])
+    none = Stretch(t[:1], round_the_circle(t[:1]), np.zeros((1, 0, 1)), None)
     assert begun(circle, 0.0, round_the_circle(0.0)).inspect(none) == Fine(0)
 
 
 @pytest.mark.parametrize("scene", ["overhead-crane", "appell-hamel"])
 def test_a_motion_with_strong_pivots_decomposes_no_matrix(scene, gallery_model, monkeypatch):
     model, (start, guess) = gallery_model(scene), (gallery[scene].start, gallery[scene].guess)
-    calls, real = [], Monitor._smallest
-    monkeypatch.setattr(Monitor, "_smallest", lambda *a: calls.append(a) or real(*a))
+    calls, real = [], Rank.along
+    monkeypatch.setattr(Rank, "along", lambda *a: calls.append(a) or real(*a))
     run = sv.simulate(model, model.start(**start, guess=guess), gallery[scene].t_span)
     assert run.success and not calls
-    late = Monitor(model, run.t[0], run.jets[: len(model.state_names), 0])
-    assert late.rank_measure(run.t[0], run.jets[: len(model.state_names), 0]) == pytest.approx(1.0) and calls
+    start = run.t[0], run.jets[: len(model.state_names), 0]
+    assert rank_from(model, *start).measure(*start) == pytest.approx(1.0) and calls
 
 
 def test_what_was_inspected_in_two_parts_is_what_was_inspected_at_once(circle):
     t = np.linspace(0.0, 2.0, 201)
-    monitor = begun(circle, 0.0, round_the_circle(0.0))
-    at_once = monitor.inspect(sampled(circle, t, round_the_circle(t)))
-    monitor = begun(circle, 0.0, round_the_circle(0.0))
-    assert monitor.inspect(sampled(circle, t[:61], round_the_circle(t[:61]))) == Fine(60)
-    later = monitor.inspect(sampled(circle, t[60:], round_the_circle(t[60:])))
-    assert isinstance(later, Repivot) and (later.steps + 60, later.t) == (at_once.steps, at_once.t)
+    rank = begun(circle, 0.0, round_the_circle(0.0))
+    at_once = rank.inspect(sampled(circle, t, round_the_circle(t)))
+    rank = begun(circle, 0.0, round_the_circle(0.0))
+    assert rank.inspect(sampled(circle, t[:61], round_the_circle(t[:61]))) == Fine(60)
+    later = rank.inspect(sampled(circle, t[60:], round_the_circle(t[60:])))
+    assert isinstance(later, Weak) and (later.steps + 60, later.t) == (at_once.steps, at_once.t)
 
 
 @pytest.mark.parametrize("crosses", [False, True])
 def test_a_pivot_that_degrades_or_changes_its_sign_is_replaced(crosses, circle):
     fine = np.linspace(0.0, 2.0, 201)  # the pivot x degrades below 0.02 at t = 1.56
     outcome = begun(circle, 0.0, round_the_circle(0.0)).inspect(sampled(circle, fine, round_the_circle(fine)))
-    assert isinstance(outcome, Repivot) and outcome.variant is None and outcome.otherwise.why == NO_CHOICE
+    assert isinstance(outcome, Weak) and outcome.steps == np.flatnonzero(fine == outcome.t)[0]
     assert fine[outcome.steps] == outcome.t == pytest.approx(np.pi / 2, abs=2 * DEGRADED)
     coarse = np.array([0.0, 1.2, 1.9, 2.6])
     x = round_the_circle(coarse)
-    outcome = begun(circle, 0.0, x[:, 0]).inspect(sampled(circle, coarse, x, crosses=crosses))
-    assert isinstance(outcome, Repivot) and (outcome.steps, outcome.t) == ((2, 1.9) if crosses else (1, 1.2))
+    outcome = begun(circle, 0.0, x[:, 0]).inspect(sampled(circle, coarse, x, lambda k, s: round_the_circle(s), crosses=crosses))
+    assert isinstance(outcome, Weak) and (outcome.steps, outcome.t) == ((2, 1.9) if crosses else (1, 1.2))
     np.testing.assert_array_equal(outcome.x, x[:, outcome.steps])
-
-
-def test_dense_output_is_left_just_before_the_zero(circle):
-    pivots, top = functions(circle)
-    t, x = np.array([0.0, 2.0]), round_the_circle(np.array([0.0, 2.0]))
-    stretch = DenseStretch(
-        t, x, pivots(2.0, x[:, 1])[:, None, None], top,
-        dense=lambda k, s: round_the_circle(s), pivots_at=pivots, resumes=True,
-    )  # fmt: skip
-    outcome = begun(circle, 0.0, x[:, 0]).inspect(stretch)
-    assert isinstance(outcome, Repivot) and (outcome.steps, outcome.t) == (0, 1.5)
-    np.testing.assert_array_equal(outcome.x, round_the_circle(1.5))
 
 
 def test_a_lost_rank_is_singular_where_it_is_lost(gallery_model):
@@ -116,10 +114,10 @@ def test_a_lost_rank_is_singular_where_it_is_lost(gallery_model):
     start = linear.start(dphi=1.0, dtheta=2.0, x=0.0, y=0.0, phi=0.0, theta=0.0)
     run = sv.simulate(linear, start, (0.0, 1.0), "Taylor", t_eval=np.linspace(0.0, 1.0, 101))
     names = list(squared.state_names)
-    x = np.array([run[name] for name in names])
-    outcome = begun(squared, 0.0, x[:, 0]).inspect(sampled(squared, run.t, x))
+    x, order = np.array([run[name] for name in names]), [linear.state_names.index(name) for name in names]
+    outcome = begun(squared, 0.0, x[:, 0]).inspect(sampled(squared, run.t, x, lambda k, s: run.at(s)[: len(names)][order]))
     assert isinstance(outcome, Singular) and run.t[outcome.steps] <= outcome.t <= run.t[outcome.steps + 1]
-    assert abs(outcome.t - cf.WHEEL_STOPS) < 1e-3
+    assert abs(outcome.t - cf.WHEEL_STOPS) < 1e-6
     assert abs(outcome.x[names.index("dphi")]) < 1e-2
 
 
