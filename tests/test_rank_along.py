@@ -39,7 +39,7 @@ def rank_from(model, t, x):
 
 def begun(model, t, x):
     rank = rank_from(model, t, x)
-    rank.begin(model, functions(model)[0](t, x))
+    rank.begin(model, t, functions(model)[0](t, x))
     return rank
 
 
@@ -50,7 +50,7 @@ def linear(t, x):
 
 def sampled(model, t, x, dense=None, **options):
     values = np.array([functions(model)[0](s, column) for s, column in zip(t[1:], x.T[1:], strict=True)]).T
-    return Stretch(t, x, values[:, :, None], dense or linear(t, x), **options)
+    return Stretch(t, x, np.ones(1), values[:, :, None], dense or linear(t, x), **options)
 
 
 def test_a_program_that_is_singular_at_its_start_says_by_how_much():
@@ -70,7 +70,7 @@ def test_a_program_that_is_singular_at_its_start_says_by_how_much():
 def test_quiet_steps_are_fine(circle):
     t = np.linspace(0.0, 0.7, 15)
     assert begun(circle, 0.0, round_the_circle(0.0)).inspect(sampled(circle, t, round_the_circle(t))) == Fine(14)
-    none = Stretch(t[:1], round_the_circle(t[:1]), np.zeros((1, 0, 1)), None)
+    none = Stretch(t[:1], round_the_circle(t[:1]), np.ones(1), np.zeros((1, 0, 1)), None)
     assert begun(circle, 0.0, round_the_circle(0.0)).inspect(none) == Fine(0)
 
 

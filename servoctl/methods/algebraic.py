@@ -122,8 +122,8 @@ class _Algebraic(Stepping):
         states = np.concatenate([nodes[:, 1 : 1 + nq].T, rates])
         if self.motion.start is None:
             self.motion.start = states[:, 0]
-            self.rank.begin(self.model, pivots[:, 0])
-        stretch = Stretch(t, states, pivots[:, 1:, None], self._between(nodes))
+            self.rank.begin(self.model, t[0], pivots[:, 0])
+        stretch = Stretch(t, states, np.ones(1), pivots[:, 1:, None], self._between(nodes))
         outcome = self.rank.inspect(stretch)
         last = self._resumption(t, outcome.steps) if isinstance(outcome, Weak) else outcome.steps
         switch = self._switch(stretch.first(last))
@@ -163,7 +163,7 @@ class _Algebraic(Stepping):
         if self.motion.stop is None:
             self._turn(switch, t1)
         if self.motion.stop is None:
-            self.rank.begin(self.model, self._pivots(switch.t, switch.x))
+            self.rank.begin(self.model, switch.t, self._pivots(switch.t, switch.x))
         return switch.t, switch.x
 
     def _resumption(self, t, last):

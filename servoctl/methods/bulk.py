@@ -98,8 +98,8 @@ class BulkSteps(Stepping):
         pivots = y[self.n_x :, quarters]
         if len(pivots):
             self.motion.count(watched=pivots.shape[1])
-        pivots = pivots.reshape(len(pivots), len(steps.t) - 1, QUARTERS)
-        return Stretch(steps.t, steps.x, pivots, steps.at, crosses=True, slope=steps.slope)
+        pivots, parts = pivots.reshape(len(pivots), len(steps.t) - 1, QUARTERS), np.arange(1, QUARTERS + 1) / QUARTERS
+        return Stretch(steps.t, steps.x, parts, pivots, steps.at, crosses=True, slope=steps.slope)
 
     def _doubted(self, stretch):
         """The number of steps that meet the equations, and the instant at which the next one does not, or None."""

@@ -316,7 +316,7 @@ class Stepping:
 
     def _begin_piece(self, t, pivots):
         """Start a piece at t [s] with pivots (n_g,)."""
-        self.rank.begin(self.model, pivots)
+        self.rank.begin(self.model, t, pivots)
         if self.switches is not None:
             self.switches.start = t
 
@@ -408,7 +408,7 @@ class Stepping:
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
         self.rank = Rank(self.model, t, x, self.tolerance)
         outputs, pivots = self._with_pivots(t, x)
-        self.rank.begin(self.model, pivots)
+        self.rank.begin(self.model, t, pivots)
         if self.rank.bad_choice(outputs, pivots):
             for derive in (False, True):  # rows may divide by a pivot that is zero there
                 self._repivot(t, x, derive)

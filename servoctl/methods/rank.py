@@ -4,6 +4,7 @@ A pivot that is small, or changes its sign, is badly chosen or shows that the ra
 the scaled L and B decide: where one of them is zero, as far as the state is known, the program is singular.
 """
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -18,8 +19,9 @@ HELPS = 5.0  # times a weak pivot: the rank measure of a matrix for which other 
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero, and one of which the reference is this is infinite
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 LOST = 0.1  # of its best: below this, rank is why no step succeeds
-ERRS = 100.0  # times its tolerance, and the way to its invariants, by which a state may be wrong
+ERRS = 10.0  # times its tolerance, and the way to its invariants, by which a state may be wrong
 NEXT = 1e-3  # of a step: the distance from its start of an instant inside, where no step lies before
+CHOSEN = "choice of dependent"  # coordinates: pivots of B, by which the rows TᵀM divide
 PARTS = 8  # of a step with weak pivots, at whose ends singular values are taken
 VANISHES = "its rows or its directions become dependent"
 CLOSELY = {"xatol": 1e-10}  # of the distance between its neighbours, to which a least value is located
@@ -54,14 +56,15 @@ class Weak:
 
 @frozen
 class Stretch:
-    """Steps with ends t (S + 1,) [s], states x (n_x, S + 1) there, and pivots (n_g, S, m) at m instants of each step.
+    """Steps with ends t (S + 1,) [s], states x (n_x, S + 1) there, and pivots (n_g, S, m) after parts of each step.
 
-    The last of these instants is the step's end. `dense` gives states (n_x, N) from steps k (N,) and times (N,) [s],
+    The last of the parts (m,) is 1, the step's end. `dense` gives states (n_x, N) from steps k (N,) and times (N,) [s],
     `slope` their derivatives. Steps that `cross` a zero of a pivot are as accurate as others.
     """
 
     t: np.ndarray
     x: np.ndarray
+    parts: np.ndarray
     pivots: np.ndarray
     dense: object
     crosses: bool = False
@@ -71,8 +74,7 @@ class Stretch:
         """The first steps alone."""
         if count >= len(self.t) - 1:
             return self
-        cut = self.t[: count + 1], self.x[:, : count + 1], self.pivots[:, :count]
-        return Stretch(*cut, self.dense, self.crosses, self.slope)
+        return replace(self, t=self.t[: count + 1], x=self.x[:, : count + 1], pivots=self.pivots[:, :count])
 
     def state(self, k, t):
         """X at an instant of step k."""
@@ -87,6 +89,17 @@ def strong(pivots, usual):
     return bool(((low * high > 0) & (least >= DEGRADED * np.maximum(largest, usual))).all())
 
 
+def may_vanish(t, sizes):
+    """Where sizes (m, N) at t (N,) have a least one among three that may have been zero beside it, (m, N - 2).
+
+    It is zero there if they fell on as steeply as on the steeper side.
+    """
+    (before, here, after), h = (sizes[:, a : a + len(t) - 2] for a in range(3)), np.diff(t)
+    with np.errstate(all="ignore"):
+        ahead, back = (before - here) * h[1:] / h[:-1], (after - here) * h[:-1] / h[1:]
+    return (here <= np.fmin(before, after)) & (here < np.fmax(ahead, back))
+
+
 class Rank:
     """L and B along a motion from x (n_x,) at t [s]; `tolerance` is that of its states.
 
@@ -98,13 +111,14 @@ class Rank:
         self.names, self.balances = leading_names(model.reduction), balances(model.reduction)
         self.largest = np.abs(np.asarray(x, dtype=float))
 
-    def begin(self, model, pivots):
-        """Start a piece with pivots (n_g,) of a model; the first step is compared with them."""
-        self.model, self.recent, self.reference, self.before = model, pivots, np.abs(pivots), None
+    def begin(self, model, t, pivots):
+        """Start a piece at t [s] with pivots (n_g,) of a model; the first step is compared with them."""
+        self.model, self.reference, self.before = model, np.abs(pivots), None
+        self.recent = np.array([t]), pivots[:, None]  # the last two instants, and pivots there
 
     def go_on(self, model, pivots, t, x):
         """Go on from a state with a model of the same rows."""
-        self.begin(model, pivots)
+        self.begin(model, t, pivots)
         self.reference = self.reference / max(self.measure(t, x), DEGRADED)
 
     # What follows belongs to the start, and most motions never read it.
@@ -158,14 +172,17 @@ class Rank:
         return result
 
     def along(self, t, x, rows):
-        """The least singular values of L and B, (2, N), their rows relative to sizes; NaN where not finite.
+        """The least singular values of L and B, (2, N), their rows relative to sizes; NaN where they have no values.
 
-        Rows TᵀM of (3.18) hold quotients of pivots; an orthonormal basis of their span does not.
+        Rows TᵀM of (3.18) hold quotients of pivots. An orthonormal basis of their span does not, and where a pivot is
+        zero its limit is that of a state so near that none could tell them apart.
         """
+        aside = self.tolerance.states(x) * np.cos(np.arange(len(x)))[:, None]
+        stacked = zip(self._stacked(t, x), self._stacked(t, x + aside), self.columns, rows, strict=True)
         result = np.ones((2, x.shape[1]))
-        parts = zip(self._stacked(t, x), self.columns, rows, ([*self.balances], []), strict=True)
-        for i, (m, c, r, some) in enumerate(parts):
-            known = np.isfinite(m).all(axis=(1, 2))
+        for i, (m, beside, c, r) in enumerate(stacked):
+            m = np.where(np.isfinite(m).all(axis=(1, 2), keepdims=True), m, beside)
+            known, some = np.isfinite(m).all(axis=(1, 2)), [] if i else [*self.balances]
             scaled = m[known] / c / np.where(r > 0, r, 1.0)[:, None]
             if some:
                 scaled[:, some] = np.linalg.qr(scaled[:, some].swapaxes(1, 2))[0].swapaxes(1, 2)
@@ -179,9 +196,9 @@ class Rank:
         return np.nan_to_num(self.along(t, x[:, None], self.rows)[:, 0])
 
     def sign(self, t, x):
-        """The sign of the determinant of [M -B; G 0], or 0 where rows divide by pivots, which may change it."""
+        """The sign of the determinant of [M -B; G 0], or 0 where other rows divide by pivots, which may change it."""
         L, Bt = self.matrices(t, x)
-        if row_pivots(self.first) or not np.isfinite(L).all():
+        if not all(name.startswith(CHOSEN) for name in row_pivots(self.first)) or not np.isfinite(L).all():
             return 0.0
         dependent = list(self.first.reduction.realisation.dependent)
         return float(np.linalg.slogdet(L)[0] * np.linalg.slogdet(Bt[:, dependent])[0])
@@ -218,45 +235,65 @@ class Rank:
         """Inspect steps that continue the inspected ones: Fine, Weak or Singular."""
         n_g, count, _ = stretch.pivots.shape
         before, self.before = self.before, stretch
-        if not stretch.pivots.size or self._all_strong(stretch.pivots.reshape(n_g, -1)):
+        t = (stretch.t[:-1, None] + np.diff(stretch.t)[:, None] * stretch.parts).ravel()
+        if not stretch.pivots.size or self._all_strong(t, stretch.pivots.reshape(n_g, -1)):
             return Fine(count)
         pole = self._pole(stretch)
         if pole is not None:
             return pole
-        changed, least = self._relative(stretch.pivots)
-        for k in map(int, np.flatnonzero((changed | (least < DEGRADED)).any(axis=0))):
+        doubtful, changed, least = self._relative(t, stretch.pivots)
+        for k in map(int, np.flatnonzero(doubtful)):
             found = self._singular(stretch, k, before) or self._weak(stretch, k, changed[:, k], least[:, k])
             if found is not None:
                 return found
         return Fine(count)
 
-    def _all_strong(self, pivots):
-        """Whether pivots (n_g, N) keep their signs and their sizes so well that nothing else needs to be inspected."""
-        last, sizes = self.recent, np.abs(pivots)
+    def _all_strong(self, t, pivots):
+        """Whether pivots (n_g, N) at t (N,) keep their signs, and are so large that no step needs to be inspected."""
+        last, sizes = self.recent[1][:, -1], np.abs(pivots)
         largest = np.maximum(sizes.max(axis=1), self.reference)
         weakest = np.minimum((pivots * np.sign(last)[:, None]).min(axis=1), np.abs(last))
         usual = np.maximum(self.reference, pivot_sizes(self.model))
         if not ((weakest > DEGRADED * largest).all() and (NEGLIGIBLE * largest <= usual).all()):
             return False
-        self.reference, self.recent = largest, pivots[:, -1]
+        if self._turns(t, pivots).any():
+            return False
+        self._accept(t, pivots, largest)
         return True
 
-    def _relative(self, pivots):
-        """Whether pivots (n_g, S, m) change their signs in steps (n_g, S), and their least sizes there (n_g, S).
+    def _turns(self, t, pivots):
+        """Whether pivots (n_g, N) at t (N,) that have no sign may have been zero at or before each instant, (N,)."""
+        if not self.model.equations.definite:
+            return np.zeros(len(t), dtype=bool)
+        before, roots = self.recent[0], np.sqrt(np.abs(np.column_stack([self.recent[1], pivots])))
+        turned = may_vanish(np.append(before, t), roots).any(axis=0)[-len(t) - 1 :]
+        turned = np.append(np.zeros(len(t) + 1 - len(turned), dtype=bool), turned)
+        return turned[:-1] | turned[1:]
+
+    def _accept(self, t, pivots, largest):
+        """Take in pivots (n_g, N) at t (N,), up to which these are the largest."""
+        before, known = self.recent
+        self.recent = np.append(before, t)[-2:], np.column_stack([known, pivots])[:, -2:]
+        self.reference = largest
+
+    def _relative(self, t, pivots):
+        """Which steps are doubtful (S,); whether pivots change their signs in them, and their least sizes, (n_g, S).
 
         Sizes are relative to the largest so far; what is not finite has none.
         """
         n_g, count, m = pivots.shape
-        track = np.nan_to_num(np.column_stack([self.recent, pivots.reshape(n_g, -1)]), posinf=0.0, neginf=0.0)
+        inner = pivots.reshape(n_g, -1)
+        track = np.nan_to_num(np.column_stack([self.recent[1][:, -1], inner]), posinf=0.0, neginf=0.0)
         sizes = np.abs(track)
         sizes[:, 0] = np.maximum(sizes[:, 0], self.reference)
         largest = np.maximum.accumulate(sizes, axis=1)
         relative = track / np.where(largest > 0, largest, 1.0)
-        self.recent, self.reference = pivots[:, -1, -1], largest[:, -1]
         signs, sizes = np.sign(relative), np.abs(relative)
         changed = (signs[:, :-1] * signs[:, 1:] < 0).reshape(n_g, count, m).any(axis=2)
         least = np.minimum(sizes[:, 1:].reshape(n_g, count, m).min(axis=2), sizes[:, :-1:m])
-        return changed, least
+        turned = self._turns(t, track[:, 1:]).reshape(count, m).any(axis=1)
+        self._accept(t, track[:, 1:], largest[:, -1])
+        return turned | (changed | (least < DEGRADED)).any(axis=0), changed, least
 
     def _pole(self, stretch):
         """Singular where a pivot grows without bound in one step, as that of a row divided by a speed that vanishes."""
@@ -289,7 +326,7 @@ class Rank:
         return Weak(steps, stretch.t[steps], stretch.x[:, steps])
 
     def _singular(self, stretch, k, before):
-        """The outcome of step k if the rank is lost in it: where a least value is zero, or since it stays zero."""
+        """The outcome of step k if the rank is lost in it: where a least value is zero, or from its start on."""
         along = _Along(self, stretch, k, stretch if k else before)
         places, signs = along.least(), [self.sign(*end) for end in along.ends]
         zeros = [t for i, t, allowed in places if not along.value(t)[i] > allowed + self._doubt(t, along)[i]]
@@ -349,17 +386,16 @@ class _Along:
         return self.rank.along(t, self.state(t)[:, None], self.rows)[:, 0]
 
     def zero(self, i):
-        """Where one of them is zero if it falls as in the step, else the start of the step."""
-        (start, end), fall = self.span, self.sizes[i, 1] - self.sizes[i, -1]
-        return start + (end - start) * max(self.sizes[i, 1], 0.0) / fall if fall > 0 else start
+        """Where one of them is zero if it falls on as in the step, else the start of the step."""
+        (start, end), first, last = self.span, self.sizes[i, 1], self.sizes[i, -1]
+        return start + (end - start) * first / (first - last) if first > last else start
 
     def least(self):
         """Where one of them has a least value: (which, t, what is nothing beside its neighbours)."""
         before, here, after = (self.sizes[:, a : a + len(self.t) - 2] for a in range(3))
-        h, found = np.diff(self.t), []
-        continued = np.fmax((before - here) * h[1:] / h[:-1], (after - here) * h[:-1] / h[1:])
+        found, may = [], may_vanish(self.t, self.sizes)
         for i, j in np.argwhere((here <= np.fmin(before, after)) & (here < np.fmax(before, after))):
-            t = self._located(i, *self.t[[j, j + 2]]) if here[i, j] < continued[i, j] else self.t[j + 1]
+            t = self._located(i, *self.t[[j, j + 2]]) if may[i, j] else self.t[j + 1]
             found.append((i, float(t), NEGLIGIBLE * max(before[i, j], after[i, j])))
         return sorted(found, key=lambda place: abs(place[1] - self.t[0]))
 

@@ -141,7 +141,7 @@ class RungeKuttaSteps(Stepping):
 
     def _inspect(self, t, states, pivots):
         """The outcome of steps; one across a pivot's zero has passed no error test and is repeated."""
-        return self._inspected(Stretch(t, states, pivots[:, 1:, None], self._between(t, states)))
+        return self._inspected(Stretch(t, states, np.ones(1), pivots[:, 1:, None], self._between(t, states)))
 
     def _between(self, t, states):
         """X from steps and times within them, by polynomials through all derivatives."""

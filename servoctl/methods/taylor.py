@@ -464,19 +464,19 @@ class TaylorSteps(Stepping):
             self.motion.count(steps=steps, nfev=steps)
             if isinstance(outcome, End) and outcome.event:  # which is the last sample
                 times = np.union1d(times, outcome.t)[:: 1 if t[-1] >= t[0] else -1]
-            times = self._sample(log, times, t[steps] if fine else outcome.t)
+            weak = isinstance(outcome, Weak)  # a step in which a pivot vanishes is sampled with the next pivots
+            times = self._sample(log, times, t[steps - weak] if fine or weak else outcome.t)
             if isinstance(outcome, End):
                 self._turn(outcome, b)
                 return outcome.t, outcome.x
-            go_on = isinstance(outcome, Weak)
-            a, x = (outcome.t, outcome.x) if go_on else (t[steps], states[:, steps].copy())
+            a, x = t[steps], states[:, steps].copy()
             self.progress(a)
             if steps == self.most:
                 order, method = self.last - self.top + 1, getattr(self.settings, "for_stiff", None)
                 leave_if_unsuited(self, method, order / np.e, t, x, interpreted=self.f.too_long)
-            if not fine:
-                self._follow(outcome)
-            elif failed:
+            if not fine and self._follow(outcome):
+                times = self._sample(log.step(steps - 1), times, a)
+            elif fine and failed:
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             row = np.concatenate([[a], x, self._outputs(a, x)])
@@ -497,10 +497,12 @@ class TaylorSteps(Stepping):
         """
         t, h, n = log.t, np.diff(log.t), self.n
         if not len(h):
+            self.inside = np.zeros((len(log.outputs) - self.n_c, 0))
             return 0
         k, at = self._instants(log)
         jets = log.jets(k, at, self.top)
-        rates = self.rates.grid(at, jets[: self.n_x], self.model.p)[self.n_x - n : self.n_x]
+        values = self.rates.grid(at, jets[: self.n_x], self.model.p)
+        rates, self.inside = values[self.n_x - n : self.n_x], values[self.n_x :, : len(INSIDE) * len(h)]
         off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
         rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
         h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
@@ -549,10 +551,13 @@ class TaylorSteps(Stepping):
         return k[within], at[within]
 
     def _stretch(self, log):
-        """The steps to be inspected, with the pivots at their ends."""
+        """The steps to be inspected, with the pivots at their ends and where their series were."""
         t, states, pivots = log.t, log.states, log.outputs[self.n_c :]
-        ends = np.column_stack([pivots[:, 1:], self._pivots(t[-1], states[:, -1])]) if len(t) > 1 else pivots
-        return Stretch(t, states, ends[:, :, None], lambda k, s: log.jets(k, s, self.top - 1), crosses=True)
+        n_g, count = pivots.shape
+        inside = self.inside.reshape(n_g, -1, len(INSIDE))[:, :count]
+        ends = np.column_stack([pivots[:, 1:], self._pivots(t[-1], states[:, -1])]) if count else pivots
+        every, parts = np.concatenate([inside, ends[:, :, None]], axis=2), np.append(INSIDE, 1.0)
+        return Stretch(t, states, parts, every, lambda k, s: log.jets(k, s, self.top - 1), crosses=True)
 
     def _sample(self, log, pending, end):
         """Keep the steps, record the pending samples up to `end` and return those that remain."""
@@ -571,7 +576,7 @@ class TaylorSteps(Stepping):
 
     def _dense(self, log):
         """What gives the jets within the steps of a log."""
-        by_rows, jets = "settled" in self.f.others, self.settings.jets or 0
+        by_rows, jets = "settled" in self.f.others and self.f is log.f, self.settings.jets or 0
         levels = max(jets, self.top - (not by_rows))
         # more accurate than as a derivative of the series
         rates = self.rates if levels < self.top or self.doubted else None
@@ -629,6 +634,10 @@ class _Log:
     def first(self, count):
         """The first steps alone."""
         return replace(self, rows=self.rows[: count + 1])
+
+    def step(self, k):
+        """Step k alone."""
+        return replace(self, rows=self.rows[k : k + 2])
 
     def jets(self, k, t, top, by_rows=False):
         """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N); see `Compiled.jets`."""
