@@ -13,9 +13,9 @@ import numpy as np
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.methods.sizes import motion_sizes
 from servoctl.model.equations import balances, gradient_jets, invariant_names, leading_names
-from servoctl.model.pivots import pivot_sizes, pivot_strength, pivots_at, row_pivots, usual_column_sizes
+from servoctl.model.pivots import pivot_sizes, usual_column_sizes
 from servoctl.model.report import explain
-from servoctl.model.variants import STRONG, derived_near, reordered_at, with_diagonal_pivots
+from servoctl.model.variants import derived_near, strong_form
 from servoctl.tolerances import ENTRY
 from servoctl.values import frozen
 
@@ -195,7 +195,6 @@ class Monitor:
         self.f, self.invariants = model.function("matrices"), model.function("invariants")
         self.l_names, self.b_names = leading_names(model.reduction)
         self.reference, self.lift = None, 1.0
-        self.earlier = () if before is None else (*(m for m in before.earlier if m is not model), before.model)
         self.balances = list(balances(model.reduction))
         self.derivations = [{row.name: row.derivation for row in model.reduction.rows}, {}]
         self.largest = np.abs(np.asarray(x, dtype=float))
@@ -396,7 +395,8 @@ class Monitor:
         if lingering is not None:
             return lingering
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
-        degraded = weakest[-1] < DEGRADED and (self.model.equations.definite or self.pivots_only(weakest[-1], t, x))
+        definite = self.model.reduction.realisation.definite
+        degraded = weakest[-1] < DEGRADED and (definite or self.pivots_only(weakest[-1], t, x))
         return _other_pivots(k + 1, t, x) if degraded else None
 
     def _touched(self, stretch, k, sizes, scale):
@@ -499,41 +499,20 @@ class Monitor:
         reference = pivot_sizes(self.model)
         return float((np.abs(pivots) / np.where(reference > 0, reference, 1.0)).min(initial=1.0))
 
-    def repivoted(self, t, x, top, same_rows=True):
+    def repivoted(self, t, x, top):
         """The model with pivots chosen at x and γ^(s̄) = top, and its monitor; None if no choice succeeds.
 
-        With pivots that the motion had before, with others of the same rows, or derived again.
+        With the same rows, solved without a choice of pivots, or derived again where these have lost their rank.
         """
         jets = np.append(x, np.nan_to_num(top))
-        other = (self._before(t, jets) or self._of_same_rows(t, x, jets)) if same_rows else None
-        if other is not None:
-            return other, Monitor(other, t, x, self)
+        blocks = self.model.reduction.cascade is not None  # whose matrices have no value where their pivots vanish
+        model = strong_form(self.model, t, jets) if blocks or self.rank_measure(t, x) > LOST else None
         sizes = {name: size for name, size in zip(self.model.state_names, self.largest, strict=True) if size > 0}
         try:
-            model = derived_near(self.model, t, jets, sizes)
+            model = model or derived_near(self.model, t, jets, sizes)
             return model, Monitor(model, t, x, self)
         except ServoError:
             return None
-
-    def _before(self, t, jets):
-        """The strongest of the earlier variants of this motion; None if all have weak pivots at these jets."""
-        strengths = [(pivot_strength(model, t, jets), -i, model) for i, model in enumerate(self.earlier)]
-        strength, _, model = max(strengths, default=(0.0, 0, None))
-        return model if strength > STRONG else None
-
-    def _of_same_rows(self, t, x, jets):
-        """The model with other pivots of the same rows; None if there are none, or the rows have lost their rank."""
-        known = self.model.reduction.cascade is None  # else matrices have no value where pivots of a block vanish
-        if known and self.rank_measure(t, x) <= LOST:
-            return None
-        return with_diagonal_pivots(self.model) or self._reordered(t, jets)
-
-    def _reordered(self, t, jets):
-        """The model with other pivots of the leading matrix, unless the rows divide by a pivot that is weak."""
-        count = len(row_pivots(self.model))
-        pivots = np.abs(pivots_at(self.model, t, jets)[:count])
-        sizes = pivot_sizes(self.model) if self.reference is None else self.reference
-        return reordered_at(self.model, t, jets) if np.all(pivots > STRONG * sizes[:count]) else None
 
     def failed(self, t, x, why, told, row):
         """The error of a state from which no step succeeds: singular for the reason `why`, or the method's own.

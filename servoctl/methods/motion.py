@@ -20,7 +20,7 @@ from servoctl.model.full import departure, other_order
 from servoctl.model.variants import derived_near
 
 CHATTERS, CHATTERS_IN = 100, 1e-3  # switches in this part of the span: the motion stays on one, as after ever less time
-MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
+MOST_CHANGES = 2  # of pivots at one instant: the same rows without a choice, then rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and as many as figures show
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
@@ -410,8 +410,8 @@ class Stepping:
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
         self.monitor = Monitor(self.model, t, x)
         if self.monitor.bad_choice(*self._with_pivots(t, x)):
-            for same_rows in (True, False):  # whose rows may divide by a pivot that is zero there
-                variant = self.monitor.repivoted(t, x, self._top(t, x), same_rows)
+            for _ in range(MOST_CHANGES):
+                variant = self.monitor.repivoted(t, x, self._top(t, x))
                 if variant is not None:
                     self._go_on(variant, t, x)
                 if not self.monitor.without_value(*self._with_pivots(t, x)):
@@ -448,7 +448,7 @@ class Stepping:
             t, x = outcome.t, outcome.x
             variant, tried = None, self.motion.changes_pivots(t)
             if tried < MOST_CHANGES:
-                variant = outcome.variant or self.monitor.repivoted(t, x, self._top(t, x), same_rows=not tried)
+                variant = outcome.variant or self.monitor.repivoted(t, x, self._top(t, x))
             if variant is not None:
                 self._go_on(variant, t, x)
                 return True
