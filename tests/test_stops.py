@@ -265,8 +265,7 @@ def test_a_particle_goes_round_and_round(kind, method, derived):
 
 def derives_again(patch):
     """Changed pivots are those of rows that are derived again, as where no others solve the same rows."""
-    patch.setattr("servoctl.methods.motion.with_diagonal_pivots", lambda model: None)
-    patch.setattr("servoctl.methods.motion.reordered_at", lambda *_: None)
+    patch.setattr("servoctl.methods.motion.strong_form", lambda *_: None)
 
 
 @pytest.mark.parametrize(("make", "method"), [("equation", "DOP853"), ("curvature", "Taylor")])

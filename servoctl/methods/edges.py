@@ -10,7 +10,7 @@ from servoctl.codegen.function import compiled
 from servoctl.dense import steps_of
 from servoctl.errors import IntegrationStopped
 from servoctl.jets.branches import domain_edges
-from servoctl.methods.pieces import RESOLUTION, End, least_between, net, residuals, row_of, terms_of
+from servoctl.methods.pieces import FIXED_STEPS, RESOLUTION, End, least_between, net, residuals, row_of, terms_of
 from servoctl.model.equations import invariant_names
 from servoctl.tolerances import ENTRY
 from servoctl.values import frozen
@@ -19,7 +19,6 @@ PARTS = 4  # of a step, at least, at whose ends arguments are evaluated
 MAY_TOUCH = 0.8  # of an argument's distances from an edge beside the least one: a vertex below this may touch the edge
 CLOSE = 1e-8  # of its largest distance so far: an argument that comes so near has met the edge, and may stay there
 JUMPS = 30.0  # times its tolerance, by which a residual changes at an edge only if it jumps
-FIXED_STEPS = 1e3  # times as much where steps have no tolerances
 OF_TERMS = 1e-3  # of its terms, which a residual does not reach a thousandth of the span away from an edge
 DISTANCES = 0.5 ** np.arange(20, 6, -1)  # of the span: distances from an edge at which residuals are compared
 EXPLAINS = 1e-3  # distance of an argument from its edge that explains why a motion cannot go on

@@ -23,12 +23,12 @@ def solved_for(equations):
     with the tolerance, what is solved for to rounding. They are chosen so that all pivots are constant or watched.
     """
     r, solved = equations.r, {}
-    for k in range(1, equations.top if r.cascade is None and not equations.definite else 1):
+    for k in range(1, equations.top if r.cascade is None and not r.orthogonal else 1):
         rows = [a for a, row in enumerate(r.rows) if row.order + (not row.affine) <= k]
         matrix = r.leading[rows, :]
         numbers = clean(*r.points.matrix(matrix))
         try:
-            order = [(rows.index(i), j) for i, j in r.order if i in rows] or pivot_order(matrix, numbers)
+            order = pivot_order(matrix, numbers)
             columns = sorted(j for _, j in order)
             order = tuple((i, columns.index(j)) for i, j in order)
             _, pivots = eliminate(matrix[:, columns], ca.SX(len(rows), 0), numbers[:, columns], order=order)
@@ -53,7 +53,7 @@ def in_independent(equations):
     that of the angles alone.
     """
     r, q, solved = equations.r, equations.q, solved_for(equations).get(1)
-    if solved is None or equations.top != 2 or r.order:
+    if solved is None or equations.top != 2:
         return None
     inside, columns, _ = solved
     others, free = ([i for i in range(q.n) if i not in some] for some in (inside, columns))

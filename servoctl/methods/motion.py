@@ -13,16 +13,16 @@ from servoctl.errors import IntegrationStopped, ServoError
 from servoctl.methods.choice import Poles
 from servoctl.methods.edges import Edges, edge
 from servoctl.methods.lost_rank import VANISHING, failed, singular
-from servoctl.methods.pieces import DEFAULT, End, Tolerance
+from servoctl.methods.pieces import DEFAULT, FIXED_STEPS, End, Tolerance
 from servoctl.methods.rank import Fine, Rank, Singular, Weak
 from servoctl.methods.sizes import from_start
 from servoctl.methods.switches import Switches, no_model, sticks
 from servoctl.model.full import departure, other_order
-from servoctl.model.variants import derived_near, reordered_at, with_diagonal_pivots
+from servoctl.model.variants import derived_near, strong_form
 
 CHATTERS, CHATTERS_IN = 100, 1e-3  # switches in this part of the span: the motion stays on one, as after ever less time
 NO_CHOICE = "no choice of pivots leads on"
-MOST_CHANGES = 2  # of pivots at one instant: those of the same rows, then of rows derived again
+MOST_CHANGES = 2  # of pivots at one instant: the same rows without a choice, then rows derived again
 DEFAULT_SAMPLES = 1001  # without t_eval: smooth curves, and as many as figures show
 SAME_INSTANT = 1e-12  # of the time: instants closer than this are one
 BESIDE_KNOTS = 0.1  # of that: how far before and after a knot a piece ends and begins, with all stages on its own side
@@ -406,12 +406,12 @@ class Stepping:
 
     def _start(self, t, x, b):
         """Choose other pivots at the start of the first piece, up to b, if the model's are a bad choice there."""
-        self.rank = Rank(self.model, t, x, self.tolerance)
+        self.rank = self._rank_from(t, x)
         outputs, pivots = self._with_pivots(t, x)
         self.rank.begin(self.model, t, pivots)
         if self.rank.bad_choice(outputs, pivots):
-            for derive in (False, True):  # rows may divide by a pivot that is zero there
-                self._repivot(t, x, derive)
+            for _ in range(MOST_CHANGES):
+                self._repivot(t, x)
                 outputs, pivots = self._with_pivots(t, x)
                 if not self.rank.without_value(outputs, pivots):
                     return
@@ -437,19 +437,21 @@ class Stepping:
         """γ^(s̄) at a state."""
         return self._outputs(t, x)[self.n_x - self.model.n : self.n_x]
 
-    def _repivot(self, t, x, derive):
-        """Go on from a state with other pivots of the same rows, or of rows that are derived there; False without."""
+    def _rank_from(self, t, x):
+        fixed = self.tolerances is None and not self.model.flat
+        return Rank(self.model, t, x, self.tolerance, FIXED_STEPS if fixed else 1.0)
+
+    def _repivot(self, t, x):
+        """Go on from a state with the same rows, solved without a choice of pivots, or derived again; False without."""
         jets = np.append(x, np.nan_to_num(self._top(t, x)))
-        model = None if derive else with_diagonal_pivots(self.model) or reordered_at(self.model, t, jets)
-        same = model is not None
-        if not same:
-            try:
-                sizes = zip(self.model.state_names, self.rank.largest, strict=True)
-                model = derived_near(self.model, t, jets, {name: size for name, size in sizes if size > 0})
-            except ServoError:
-                return False
+        sizes = {name: size for name, size in zip(self.model.state_names, self.rank.largest, strict=True) if size > 0}
+        try:
+            model = strong_form(self.model, t, jets) or derived_near(self.model, t, jets, sizes)
+        except ServoError:
+            return False
+        same = model.reduction.rows is self.model.reduction.rows
         self._use(model)
-        self.rank = self.rank if same else Rank(model, t, x, self.tolerance)
+        self.rank = self.rank if same else self._rank_from(t, x)
         self.rank.go_on(model, self._pivots(t, x), t, x)
         self.motion.count(pivot_changes=1)
         return True
@@ -459,7 +461,7 @@ class Stepping:
         at, why = (outcome.at, outcome.why) if isinstance(outcome, Singular) else (outcome.t, NO_CHOICE)
         if isinstance(outcome, Weak):
             tried = self.motion.changes_pivots(outcome.t)
-            if tried < MOST_CHANGES and self._repivot(outcome.t, outcome.x, derive=tried > 0):
+            if tried < MOST_CHANGES and self._repivot(outcome.t, outcome.x):
                 return True
         stop = self.edges and self.edges.stopped(self.model, outcome.t)
         self.motion.end_after(outcome.t, stop or singular(self.rank, at, outcome.x, why))

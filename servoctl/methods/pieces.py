@@ -10,6 +10,7 @@ from servoctl.values import frozen
 
 LEAVES = 1e3  # times its tolerance: a residual beyond it differs from zero
 DEFAULT = 1e-9, 1e-11  # rtol and atol that judge steps of fixed length
+FIXED_STEPS = 1e3  # times the default tolerances, by which steps without tolerances may err
 LEAST_RTOL, LEAST_ATOL = 1e-12, 1e-14  # rounding of residuals: smaller tolerances are not resolved
 AT_ONCE = 16  # steps in Python that are inspected together, at most
 RESOLUTION = 1000  # instants of a span, at least, at which functions of the motion are inspected within steps

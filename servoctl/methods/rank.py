@@ -11,6 +11,7 @@ import numpy as np
 
 from servoctl.model.equations import balances, invariant_names, leading_names
 from servoctl.model.pivots import pivot_sizes, row_pivots, usual_column_sizes
+from servoctl.reduction.range_space import OF_CHOICE
 from servoctl.tolerances import ENTRY
 from servoctl.values import frozen
 
@@ -21,7 +22,6 @@ HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 LOST = 0.1  # of its best: below this, rank is why no step succeeds
 ERRS = 10.0  # times its tolerance, and the way to its invariants, by which a state may be wrong
 NEXT = 1e-3  # of a step: the distance from its start of an instant inside, where no step lies before
-CHOSEN = "choice of dependent"  # coordinates: pivots of B, by which the rows TᵀM divide
 PARTS = 8  # of a step with weak pivots, at whose ends singular values are taken
 VANISHES = "its rows or its directions become dependent"
 CLOSELY = {"xatol": 1e-10}  # of the distance between its neighbours, to which a least value is located
@@ -101,13 +101,13 @@ def may_vanish(t, sizes):
 
 
 class Rank:
-    """L and B along a motion from x (n_x,) at t [s]; `tolerance` is that of its states.
+    """L and B along a motion from x (n_x,) at t [s], whose states err by `error` times a tolerance.
 
     The model may change to one of the same rows with other pivots (`go_on`).
     """
 
-    def __init__(self, model, t, x, tolerance):
-        self.first, self.start, self.tolerance = model, (t, np.array(x)), tolerance
+    def __init__(self, model, t, x, tolerance, error=1.0):
+        self.first, self.start, self.tolerance, self.error = model, (t, np.array(x)), tolerance, error
         self.names, self.balances = leading_names(model.reduction), balances(model.reduction)
         self.largest = np.abs(np.asarray(x, dtype=float))
 
@@ -198,7 +198,7 @@ class Rank:
     def sign(self, t, x):
         """The sign of the determinant of [M -B; G 0], or 0 where other rows divide by pivots, which may change it."""
         L, Bt = self.matrices(t, x)
-        if not all(name.startswith(CHOSEN) for name in row_pivots(self.first)) or not np.isfinite(L).all():
+        if not all(name.startswith(OF_CHOICE) for name in row_pivots(self.first)) or not np.isfinite(L).all():
             return 0.0
         dependent = list(self.first.reduction.realisation.dependent)
         return float(np.linalg.slogdet(L)[0] * np.linalg.slogdet(Bt[:, dependent])[0])
@@ -263,10 +263,10 @@ class Rank:
 
     def _turns(self, t, pivots):
         """Whether pivots (n_g, N) at t (N,) that have no sign may have been zero at or before each instant, (N,)."""
-        if not self.model.equations.definite:
+        if not self.model.reduction.orthogonal:
             return np.zeros(len(t), dtype=bool)
-        before, roots = self.recent[0], np.sqrt(np.abs(np.column_stack([self.recent[1], pivots])))
-        turned = may_vanish(np.append(before, t), roots).any(axis=0)[-len(t) - 1 :]
+        before, sizes = self.recent[0], np.abs(np.column_stack([self.recent[1], pivots]))
+        turned = may_vanish(np.append(before, t), sizes).any(axis=0)[-len(t) - 1 :]
         turned = np.append(np.zeros(len(t) + 1 - len(turned), dtype=bool), turned)
         return turned[:-1] | turned[1:]
 
@@ -317,7 +317,7 @@ class Rank:
 
     def _weak(self, stretch, k, changed, least):
         """The outcome of step k if other pivots are better there, by signs that change and least sizes (n_g,)."""
-        among = slice(len(row_pivots(self.model))) if self.model.equations.definite else slice(None)
+        among = slice(len(row_pivots(self.model))) if self.model.reduction.orthogonal else slice(None)
         changed, least = changed[among], least[among]
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
         if not len(least) or not changed.any() and self.measure(t, x) < HELPS * max(least.min(), NEGLIGIBLE):
@@ -345,7 +345,7 @@ class Rank:
         rank of these is lost.
         """
         x, model = along.state(t)[:, None], self.model
-        sizes, m, ways = self.tolerance.states(x), len(invariant_names(model)), np.eye(len(x))
+        sizes, m, ways = self.tolerance.states(x), len(invariant_names(model)), self.error * np.eye(len(x))
         if m:
             f = model.function("invariants")
             slopes, off = f(t, x[:, 0], model.p)[m:].reshape(-1, m).T, [f(*end, model.p)[:m] for end in along.ends]

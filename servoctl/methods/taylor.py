@@ -26,10 +26,9 @@ from servoctl.methods.motion import SAME_INSTANT, Stepping, breakpoints, interru
 from servoctl.methods.pieces import AT_ONCE, RESOLUTION, End, Tolerance, net
 from servoctl.methods.rank import DEGRADED, Fine, Stretch, Weak
 from servoctl.methods.sizes import from_start
-from servoctl.model.equations import invariant_names, monitored_rows
+from servoctl.model.equations import invariant_names
 from servoctl.model.pivots import pivot_sizes
 from servoctl.reduction.cascade import Running
-from servoctl.reduction.ranks import clean, eliminate
 from servoctl.values import frozen
 
 LOWEST, HIGHEST = 4, 24  # orders: below, steps are too short; above, compiling grows faster than steps
@@ -106,7 +105,7 @@ class _Rows:
         self.r, self.top, self.motion = equations.r, equations.top, _Motion(equations)
         self.solved = solved_for(equations)
         every = range(len(self.r.rows))
-        self.rows, self.leading, self.stages = self.r.rows, self.r.leading, [(every, every, self.r.order)]
+        self.rows, self.leading, self.stages = self.r.rows, self.r.leading, [(every, every, ())]
         reduced = in_independent(equations)
         if reduced:
             self.rows, self.leading, first = reduced
@@ -139,7 +138,7 @@ class _Rows:
 
     def _solution(self, rows, columns, order, right):
         matrix = self.leading[list(rows), list(columns)]
-        return eliminate(matrix, right, clean(*self.r.points.matrix(matrix)), order=order)[0]
+        return self.r.solved(matrix, right, order)[0]
 
     def by_rows(self, outputs):
         """Outputs with the velocities that rows determine in place of those of the state, which need not meet the rows.
@@ -178,7 +177,7 @@ def taylor_coefficients(equations, last):
     if r.cascade is not None:
         motion = r.cascade.along(r.points, equations.top - 1, last)
         return _coefficients(equations, motion.place, motion.gamma, last)
-    if equations.definite:
+    if equations.range_space:
         motion = _with_multipliers(equations, last)
         return _coefficients(equations, motion.coordinates, motion.gamma, last)
     rows = _by_rows(equations, last)
@@ -198,7 +197,8 @@ def _with_multipliers(equations, last):
     r, motion = equations.r, _Reacting(equations)
     for k in range(1, equations.top):
         motion.guess(k, ())
-    rows, forces = monitored_rows(r), (r.balance - r.realisation.B @ motion.multipliers).elements()
+    rows = [row for row in r.rows if row.kind != "dynamics"]
+    forces = (r.balance - r.realisation.B @ motion.multipliers).elements()
     groups, balance = _groups(motion, rows, range(len(rows))), _Group(motion, 2, range(len(forces)), forces)
     for group in groups:
         for _ in range(group.order, motion.top):
@@ -554,7 +554,7 @@ class TaylorSteps(Stepping):
         """The steps to be inspected, with the pivots at their ends and where their series were."""
         t, states, pivots = log.t, log.states, log.outputs[self.n_c :]
         n_g, count = pivots.shape
-        inside = self.inside.reshape(n_g, -1, len(INSIDE))[:, :count]
+        inside = self.inside[:, : count * len(INSIDE)].reshape(n_g, count, len(INSIDE))
         ends = np.column_stack([pivots[:, 1:], self._pivots(t[-1], states[:, -1])]) if count else pivots
         every, parts = np.concatenate([inside, ends[:, :, None]], axis=2), np.append(INSIDE, 1.0)
         return Stretch(t, states, parts, every, lambda k, s: log.jets(k, s, self.top - 1), crosses=True)

@@ -10,7 +10,7 @@ from servoctl.codegen.paths import combined
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import size_of_terms, sizes_of_terms
 from servoctl.model import saddle
-from servoctl.reduction.definite import Definite
+from servoctl.reduction.range_space import RangeSpace, applies
 from servoctl.reduction.ranks import clean, column_sizes, eliminate
 from servoctl.reduction.rows import row_levels
 from servoctl.spec.coordinates import jet_name
@@ -129,12 +129,13 @@ class Equations(Invariants):
 
         The rows of a flat program are constraints alone: they give γ^(s̄) without the inertia.
         """
-        return self.definite or (self.r.free > 0 and self.q.n > saddle.FEW and saddle.applies(self.r))
+        many = not self.r.orthogonal and self.r.free > 0 and self.q.n > saddle.FEW
+        return self.range_space or (many and applies(self.r))
 
     @property
-    def definite(self):
-        """Whether pivots are diagonal entries of definite matrices."""
-        return isinstance(self.r.realisation, Definite)
+    def range_space(self):
+        """Whether the inertia is eliminated first."""
+        return isinstance(self.r.realisation, RangeSpace)
 
     @cached_property
     def saddle(self):
@@ -276,8 +277,7 @@ class Equations(Invariants):
             )
         residual = ca.vertcat(residual, *q.invariants.values())
         matrix = ca.jacobian(residual, q.jet(0))
-        values, sizes = self.r.points.matrix(matrix)
-        return eliminate(matrix, -residual, clean(values, sizes))[0]
+        return self.r.solved(matrix, -residual)[0]
 
     def matrices(self):
         """L and Bᵀ, column by column, whose ranks must not change, and the diagonal of M, which scales columns."""
@@ -541,9 +541,9 @@ def balances(reduction):
 
 
 def monitored_rows(reduction):
-    """Rows of L; with pivots of definite matrices the constraints alone, whose rank is that of all."""
+    """Rows of L; where G M⁻¹B is definite the constraints alone, whose rank is that of all."""
     rows = reduction.rows
-    return [row for row in rows if row.kind != "dynamics"] if isinstance(reduction.realisation, Definite) else rows
+    return [row for row in rows if row.kind != "dynamics"] if reduction.realisation.definite else rows
 
 
 def leading_names(reduction):

@@ -22,7 +22,7 @@ from servoctl.model.report import describe, warn_of_products
 from servoctl.model.rest import started
 from servoctl.model.start import State
 from servoctl.model.store import Store, pack, unpack
-from servoctl.model.variants import form_of, place_of
+from servoctl.model.variants import FREE, place_of
 from servoctl.progress import stage
 from servoctl.reduction.appell import require_positive
 from servoctl.reduction.idle import names_of, needed
@@ -289,7 +289,8 @@ class Model(Detailed):
         build : callable
         """
         if name not in self._functions:
-            self._functions[name] = self._store.recall(name, build)
+            entry = f"{FREE} {name}" if self.reduction.orthogonal else name
+            self._functions[name] = self._store.recall(entry, build)
         return self._functions[name]
 
     def function(self, name):
@@ -464,6 +465,4 @@ def _samples(model, motion, jets):
 
 def _unpickled(mechanism, content, choices, parameters, paths):
     reduction = unpack(content, mechanism)
-    store = Store(mechanism, reduction.program, *choices)
-    form = form_of(reduction)
-    return Model(reduction, store.part(form) if form else store, parameters, paths=paths)
+    return Model(reduction, Store(mechanism, reduction.program, *choices), parameters, paths=paths)

@@ -5,10 +5,10 @@ import numpy as np
 from servoctl.model.following import instants_of
 
 
-def pivots_at(model, t, jets):
-    """Pivots (n_g,) at an instant t [s] with jets (n_z,)."""
+def pivots_at(model, t, jets, count=None):
+    """Pivots (n_g,), or the first of them, at an instant t [s] with jets (n_z,)."""
     here = model.reduction.points.at(instants_of(model, [t]), jets[:, None], model.parameters)
-    return here.only_values([pivot for _, pivot in model.equations.pivots])[:, 0].astype(float)
+    return here.only_values([pivot for _, pivot in model.equations.pivots[:count]])[:, 0].astype(float)
 
 
 def pivot_sizes(model):
@@ -17,8 +17,9 @@ def pivot_sizes(model):
 
 
 def pivot_strength(model, t, jets):
-    """The smallest pivot at an instant, relative to its size where pivots were chosen; 0 if one has no value."""
-    pivots, sizes = np.abs(pivots_at(model, t, jets)), pivot_sizes(model)
+    """The smallest chosen pivot at an instant, relative to its size where pivots were chosen; 0 if one has no value."""
+    count = len(row_pivots(model)) if model.reduction.orthogonal else None
+    pivots, sizes = np.abs(pivots_at(model, t, jets, count)), pivot_sizes(model)[:count]
     relative = pivots / np.where(sizes > 0, sizes, 1.0)
     return float(np.nan_to_num(relative, nan=0.0, posinf=0.0).min(initial=1.0))
 

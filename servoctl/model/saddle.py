@@ -12,8 +12,8 @@ import numpy as np
 
 from servoctl.codegen.emit import operations
 from servoctl.errors import SpecificationError
-from servoctl.reduction.definite import Definite
 from servoctl.reduction.lifting import lifted
+from servoctl.reduction.range_space import RangeSpace, applies
 from servoctl.reduction.ranks import clean, eliminate
 
 FEW = 8  # quasi-velocities: up to this number (3.18) takes about as few operations
@@ -21,21 +21,14 @@ SPARED = 0.95  # of the work of [M -B; G 0] below which the system with shared s
 CLOSE = 1.1  # ratio of operations up to which the forms are compared after common terms are merged
 
 
-def applies(reduction):
-    """Whether the balance and the constraints determine γ'': s̄ = 2, and no row of (3.18) is differentiated."""
-    dynamics = [row for row in reduction.rows if row.kind == "dynamics"]
-    return reduction.top == 2 and all(row.order == 2 and not row.derivation for row in dynamics)
-
-
 def solve(equations, poles=False):
     """γ'' (n,), the multipliers μ (b,) and the list of pivots; `poles` adds the constraints' error dynamics."""
     r, q = equations.r, equations.q
     constraints = [a for a, row in enumerate(r.rows) if row.kind != "dynamics"]
-    if isinstance(r.realisation, Definite):
+    if isinstance(r.realisation, RangeSpace):
         rest = ca.substitute(r.balance, q.jet(2), ca.SX.zeros(q.n))
         second = ca.vertcat(ca.SX(0, 1), *equations.rest(constraints, poles))
-        acceleration, mu, pivots = r.realisation.solve(-rest, -second)
-        return acceleration, mu, [ca.sign(p) * ca.sqrt(ca.fabs(p)) for p in pivots]  # of the size of singular values
+        return r.realisation.solve(-rest, -second)
     system = matrix(equations)
     rest = ca.substitute(r.balance, q.jet(2), ca.SX.zeros(q.n))
     right = -ca.vertcat(rest, *equations.rest(constraints, poles))
@@ -82,12 +75,13 @@ def accelerations(equations):
             order=r.top,
             hidden=[row.name for row in r.hidden],
         )
-    sparse = ca.vertcat(*equations.saddle[:2])
-    if equations.definite or q.n > FEW:
-        return equations.function("accelerations", equations.state, [sparse])
+    if equations.range_space or (q.n > FEW and not r.orthogonal):
+        return equations.function("accelerations", equations.state, equations.saddle[:2])
     solution, acceleration = equations.dense(), q.jet(2)
     dense = ca.vertcat(solution, ca.substitute(r.multipliers, acceleration, solution))
-    few, many = sorted((sparse, dense), key=_instructions)
+    if r.orthogonal:
+        return equations.function("accelerations", equations.state, [dense])
+    few, many = sorted((ca.vertcat(*equations.saddle[:2]), dense), key=_instructions)
     near = _instructions(many) < CLOSE * _instructions(few)
     columns = (few, many) if near else (few,)
     functions = [equations.function("accelerations", equations.state, [y]) for y in columns]

@@ -15,7 +15,7 @@ from servoctl.model.equations import Invariants, invariant_names
 from servoctl.model.following import instants_of
 from servoctl.model.jets import jet_names_to
 from servoctl.model.rests import GUESSED, Rests, frame, roots_of_inertia
-from servoctl.model.variants import derived_near, reordered_at, strong_near
+from servoctl.model.variants import derived_near, strong_form, strong_near
 from servoctl.reduction.hidden import OUT_OF_REACH
 from servoctl.spec.mechanism import require_known
 from servoctl.spec.references import function_of, orders_in
@@ -330,7 +330,7 @@ def _solve(model, equations, aim, conditions):
     blocks = model.reduction.cascade is not None
     if not residual < TOLERANCE and blocks:
         x, residual = _by_blocks(model, t, equations, aim)
-    choices = [(aim.reference, reordered_at)] * blocks + [(aim.reference, derived_near), (None, derived_near)]
+    choices = [(aim.reference, strong_form)] * blocks + [(aim.reference, derived_near), (None, derived_near)]
     for at, choose in choices:
         if residual < TOLERANCE:
             break

@@ -14,7 +14,6 @@ import pickle
 import platform
 import sys
 import time
-from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,13 +44,7 @@ class Store:
 
     def __init__(self, mechanism, program, guess=None, near=None, values=None):
         self.specification = mechanism, program, dict(guess) if isinstance(guess, dict) else guess, near, values
-        self.fingerprint, self._part = fingerprint(*self.specification), ""
-
-    def part(self, name):
-        """The entries of another form of the equations, beside those of this store."""
-        other = copy(self)
-        other._part = f"{name} "
-        return other
+        self.fingerprint = fingerprint(*self.specification)
 
     def recall(self, name, build):
         """The entry of this name; if there is none, the value of `build()`, which is written.
@@ -93,7 +86,7 @@ class Store:
         stamp = None if os.environ.get("SERVOCTL_MEMO") == "none" else _stamp()
         if stamp is None or self.fingerprint is None:
             return None
-        entry = hashlib.sha256(f"{stamp} {self.fingerprint} {self._part}{name}".encode()).hexdigest()
+        entry = hashlib.sha256(f"{stamp} {self.fingerprint} {name}".encode()).hexdigest()
         return cache_directory() / "derived" / entry
 
 

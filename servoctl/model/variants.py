@@ -1,4 +1,4 @@
-"""The same model with other pivots: those of a state near by or of an instant, or the diagonal of definite matrices.
+"""The same model with other pivots: those of a state near by, or systems that are solved without a choice of pivots.
 
 Variants near a state are shared by the models of other parameters and paths: one whose pivots are strong at another
 state serves there, too.
@@ -8,17 +8,15 @@ from contextlib import suppress
 
 import numpy as np
 
-from servoctl.errors import ServoError, SingularProgram, SpecificationError
-from servoctl.model import saddle
-from servoctl.model.following import instants_of
+from servoctl.errors import ServoError, SpecificationError
 from servoctl.model.full import affirmed
 from servoctl.model.pivots import pivot_strength
-from servoctl.reduction.definite import Definite, definite
+from servoctl.reduction import range_space
 from servoctl.reduction.manifold import references_at
 from servoctl.spec.references import required_paths
 from servoctl.tolerances import ENTRY, RESOLVED
 
-DIAGONAL = "diagonal"  # pivots of definite matrices, beside places of other pivots
+FREE = "without a choice"  # of pivots, beside places of others
 NEAR = "near"  # variants near states, derived with the parameters at which ranks were decided
 STRONG = 0.1  # of its usual size: pivots above this serve for other parameters, or again
 MOST_VARIANTS = 8  # of a model that it holds: motions from one start meet the same ones again
@@ -38,8 +36,10 @@ def derived_near(model, t, jets, sizes=()):
     key = repr(place)
     if key not in model._variants:
         base = model._variants[None]
-        known = (near for near in tuple(base._functions.get(NEAR, {}).values()) if _serves(base, near, t, jets))
-        near = base._with(next(known, None) or _near(base, place), base._variants)
+        others = (v for v in tuple(base._functions.get(NEAR, {}).values()) if v.reduction is not model.reduction)
+        found = next((v for v in others if _serves(base, v, t, jets)), None) or _near(base, place)
+        held = (v for v in base._variants.values() if v.reduction is found.reduction)
+        near = next(held, None) or base._with(found, base._variants)
         if near.free != model.free:
             raise SpecificationError(
                 f"Near t = {t:.6g} s the program has {near.free} free initial values, elsewhere {model.free}.",
@@ -56,7 +56,8 @@ def derived_near(model, t, jets, sizes=()):
 def strong_near(model, t, jets):
     """The model, or where its pivots vanish at an instant the one with pivots chosen there, if any."""
     try:
-        return model if pivot_strength(model, t, jets) > RESOLVED else derived_near(model, t, jets)
+        strong = model if pivot_strength(model, t, jets) > RESOLVED else strong_form(model, t, jets)
+        return strong or derived_near(model, t, jets)
     except ServoError:
         return model
 
@@ -88,60 +89,41 @@ def _serves(base, near, t, jets):
     return strong and near.free == base.free and (same or affirmed(near, base.parameters[:, None])[0])
 
 
-def with_diagonal_pivots(model):
-    """The model with diagonal entries of definite matrices as pivots (`reduction.definite`); None without such."""
-    first = model._variants[None]
-    applies = not (first.equations.definite or first.flat) and saddle.applies(first.reduction)
-    return _formed(first, DIAGONAL) if applies else None
+def strong_form(model, t, jets):
+    """The model as first derived, or without a choice of pivots, if what its rows divide by is strong at an instant.
 
-
-def reordered_at(model, t, jets):
-    """The model with the same rows, and pivots of their leading matrix chosen at an instant.
-
-    None if the pivots stay, or are not those of the leading matrix.
+    Where a model that chooses no pivots is weak, its rows are, and only others help.
     """
-    r = model.reduction
-    if model.equations.definite or model.equations.sparse or (r.cascade is None and model.flat and model.nq != model.n):
-        return None
-    try:
-        order = r.order_at(instants_of(model, [t]), np.asarray(jets, dtype=float), model.parameters)
-    except SingularProgram:
-        return None
-    return None if order == r.order else _formed(model, order)
+    base = model._variants[None]
+    others = model.reduction.rows is not base.reduction.rows
+    made = [(base, False)] * others + [(model, True)] * (not model.reduction.orthogonal) + [(base, True)] * others
+    forms = (without_choice(each) if free else each for each, free in made)
+    return next((form for form in forms if pivot_strength(form, t, jets) > STRONG), None)
+
+
+def without_choice(model):
+    """The model with the same rows, whose systems are solved without a choice of pivots (`reduction.range_space`)."""
+    near = model._store.specification[3] or ()
+    key = repr((*near, FREE))
+    if model.reduction.orthogonal or key in model._variants:
+        return model._variants.get(key, model)
+    functions, reduction = model._functions.setdefault(FREE, {}), range_space.without_choice(model.reduction)
+    numbers = model.parameters, functions, model._variants, model.paths
+    return _keep(model._variants, key, type(model)(reduction, model._store, *numbers))
 
 
 def place_of(model):
-    """How pivots were chosen: (t, jets, sizes) of `derived_near`, then their places or `DIAGONAL`; None as derived."""
-    near, form = model._store.specification[3] or (), form_of(model.reduction)
-    return (*near, form) if form else near or None
-
-
-def form_of(reduction):
-    """`DIAGONAL`, or the places of pivots of the leading matrix; empty if they are chosen at the points."""
-    return DIAGONAL if isinstance(reduction.realisation, Definite) else reduction.order
+    """How pivots were chosen: (t, jets, sizes) of `derived_near`, then `FREE` if none are; None as derived."""
+    near, free = model._store.specification[3] or (), (FREE,) * model.reduction.orthogonal
+    return (*near, *free) or None
 
 
 def variant_at(model, place):
-    """The variant of a place (`place_of`); the model if that is None."""
+    """The variant of a place (`place_of`); the model if that is None. What names other pivots is solved without."""
     place = place or ()
-    near, form = place[:3] if len(place) > 1 else (), place[-1] if len(place) % 3 == 1 else None
-    if near:
-        model = model._with(_near(model._variants[None], tuple(near)), model._variants)
-    if form is None:
-        return model
-    return _formed(model, form if form == DIAGONAL else tuple((i, j) for i, j in form))
-
-
-def _formed(model, form):
-    """The model with the same rows, and pivots by their places, or from the diagonal; None without the latter."""
-    key, r = repr((*(model._store.specification[3] or ()), form)), model.reduction
-    if key in model._variants:
-        return model._variants[key]
-    reduction = definite(r) if form == DIAGONAL else r.with_order(form)
-    store, functions = model._store.part(form), model._functions.setdefault(str(form), {})
-    numbers = model.parameters, functions, model._variants, model.paths
-    made = reduction and type(model)(reduction, store, *numbers)
-    return _keep(model._variants, key, made)
+    if len(place) > 1:
+        model = model._with(_near(model._variants[None], tuple(place[:3])), model._variants)
+    return without_choice(model) if len(place) % 3 == 1 else model
 
 
 def _keep(variants, key, variant):

@@ -24,6 +24,7 @@ class Realisation:
     dependent: tuple  # indices of quasi-coordinates
     independent: tuple  # indices of the others
     numbers: np.ndarray  # (b, n, N), Bᵀ at the points where the split was chosen
+    definite: bool = False  # whether μ follows from a definite matrix, whose pivots have no sign to change
     settled: tuple = ()  # where the program leaves actuation open, the rows that hold whichever is taken
     unreached: tuple = ()  # independent quasi-coordinates whose balance no actuator enters: the settled rows contain it
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from servoctl.jets.series import Motion, Series, is_zero, shifted
 from servoctl.jets.tape import REAL, Tape, add, column_of, divide, multiply
-from servoctl.reduction.ranks import clean, eliminate, pivot_order, solve_clean
+from servoctl.reduction.ranks import clean, eliminate, orthogonal, solve_clean
 from servoctl.values import frozen
 
 PLACING = 100  # Newton steps to the coordinates of a block, each of at most their size
@@ -38,7 +38,6 @@ class Block:
     places: tuple  # of the rows in the reduction
     columns: tuple  # quasi-velocities of the block
     coordinates: tuple  # those whose rates follow from these and earlier ones
-    order: tuple = ()  # row and column of each pivot of its leading matrix; empty if they are chosen at points
 
     def leading(self, q):
         """∂ψ/∂γ^(order) in the block's own quasi-velocities, square SX."""
@@ -51,6 +50,7 @@ class Cascade:
 
     q: object
     blocks: tuple
+    orthogonal: bool = False  # whether blocks are solved without a choice of pivots
 
     @property
     def rows(self):
@@ -109,23 +109,6 @@ class Cascade:
         """The points that satisfy the rows up to a level, from others near them."""
         z, solved = self.continued(points, level)
         return replace(points, z=z).take(np.flatnonzero(solved))
-
-    def order_at(self, points, given, level):
-        """Pivots ((row, column), ...) of the reduction's rows, block by block, chosen at jets up to the given level."""
-        points, order = replace(points, z=self.continued(points, level, given)[0]), []
-        for block in self.blocks:
-            leading = block.leading(self.q)
-            pivots = pivot_order(leading, clean(*points.matrix(leading)), sieved=False)
-            order += [(block.places[i], block.columns[j]) for i, j in pivots]
-        return tuple(order)
-
-    def with_order(self, order):
-        """The cascade with other pivots, as `order_at` chooses them."""
-        blocks = []
-        for block in self.blocks:
-            pairs = ((block.places.index(i), block.columns.index(j)) for i, j in order if i in block.places)
-            blocks.append(replace(block, order=tuple(pairs)))
-        return replace(self, blocks=tuple(blocks))
 
     def along(self, points, given, level, correct=False, errors=None):
         """The motion by jets up to a given level, and Newton steps to its coordinates where it is `correct`ed first.
@@ -240,6 +223,7 @@ class Expressions(_Follow):
         place = {0: list(q), **({k: list(gamma[k]) for k in gamma} if q.plain else {})}
         super().__init__(cascade, gamma, place)
         self.points, self.given, self.correct, self.matrix, self.errors = points, given, correct, None, {}
+        self.orthogonal = cascade.orthogonal
         self.levels, self.newton, self.pivots = {}, [ca.SX(0)] * q.nq, []
         self.passed_on = {cascade.blocks[m].places for jets in cascade.jets for _, m in jets}
 
@@ -284,7 +268,7 @@ class Expressions(_Follow):
             right[a] -= self.errors.get(block.places[a], 0.0) / factorial(level)
         right = ca.vertcat(*right.values())
         numbers = clean(*self.points.matrix(block.leading(self.q)))
-        solution, pivots = eliminate(self.matrix, right, numbers, order=block.order)
+        solution, pivots = (orthogonal if self.orthogonal else eliminate)(self.matrix, right, numbers)
         if first and level:
             self.pivots += pivots
         return [0.0 if x.is_zero() else x for x in solution.elements()]

@@ -6,7 +6,8 @@ extended precision), or resolved in double precision, or between these: ill-cond
 
 Symbolic elimination keeps its pivots for all later instants: it takes the pivot with the least fill-in (Markowitz)
 among those of sufficient size at the points, and leaves out entries that vanish identically. It returns the pivots,
-whose size along a motion shows when the choice has become bad.
+whose size along a motion shows when the choice has become bad. Then rows that are made orthogonal one after the other
+solve the system without a choice, with some more operations.
 """
 
 import casadi as ca
@@ -223,13 +224,10 @@ def _difference(a, b):
     return np.where(np.abs(result) <= ENTRY * (np.abs(a) + np.abs(b)), 0.0, result)
 
 
-def pivot_order(matrix, numbers, sieved=True):
-    """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points.
-
-    Unless `sieved`, what vanishes identically counts as fill-in: to find it takes most of the time.
-    """
+def pivot_order(matrix, numbers):
+    """Pivots ((row, column), ...) of a matrix (m, n) SX in their order, chosen by its numbers (m, n, N) at points."""
     n = matrix.shape[0]
-    system = _System(matrix, ca.SX(n, 0), numbers, sieved=sieved)
+    system = _System(matrix, ca.SX(n, 0), numbers)
     with np.errstate(all="ignore"):
         return tuple(system.step() for _ in range(n))
 
@@ -256,19 +254,56 @@ def eliminate(matrix, right, numbers, diagonal=False, order=(), in_order=False):
     return ca.vertcat(*(row[0] for row in solution)), pivots
 
 
+def orthogonal(matrix, right, numbers):
+    """Solve A X = B symbolically without a choice of pivots: the solution (n, m) SX, and the pivots.
+
+    Each row is made orthogonal to those before it, its right side with it (modified Gram-Schmidt), after columns were
+    scaled by `numbers` (n, n, N), A at N points. Pivots are the norms of what is left of the rows, the last one with
+    the sign of det A: they vanish only where A is singular.
+    """
+    n = matrix.shape[0]
+    columns = equilibrate(np.moveaxis(numbers, 2, 0))[2].astype(float)
+    scale = ca.diag(ca.DM(np.exp(np.log(columns).mean(axis=0))))
+    rows, units, pivots = ca.horzcat(matrix @ scale, right), [], []
+    for row in ca.vertsplit(rows):
+        for unit in units:
+            along = ca.dot(row[:n], unit[:n])
+            row = row if along.is_zero() else row - along * unit
+        pivots.append(ca.norm_2(row[:n]))
+        units.append(row / pivots[-1])
+    solution = ca.SX(n, right.shape[1])
+    for unit in reversed(units):
+        solution += unit[:n].T @ (unit[n:] - unit[:n] @ solution)
+    if n:
+        pivots[-1] = _determinant(ca.vertcat(*units[:-1], row)[:, :n])
+    return scale @ solution, pivots
+
+
+def _determinant(rest):
+    """The determinant of rows (n, n) SX, orthonormal but for the last one, by reflections to the axes (Householder)."""
+    result = ca.SX(1)
+    while rest.shape[0] > 1:
+        side = ca.if_else(rest[0, 0] < 0, -1, 1)
+        normal = rest[0, :]
+        normal[0] += side
+        rest = (rest - (rest @ normal.T) @ normal / ca.fabs(normal[0]))[1:, 1:]
+        result *= side
+    return result * rest
+
+
 class _System:
     """A system under elimination.
 
     `rows` has for each row its entries by column: an SX scalar, and its equilibrated numbers at the points where pivots
-    are chosen. If `sieved`, what is zero at all of them is left out if it vanishes identically. `candidates` are the
-    columns whose entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
+    are chosen. What is zero at all of them is left out if it vanishes identically. `candidates` are the columns whose
+    entries may be pivots; `open` lists the rows that were no pivot rows yet, `members` those of a column.
     """
 
-    def __init__(self, matrix, right, numbers, diagonal=False, in_order=False, sieved=True):
-        n, self.diagonal, self.in_order, self.sieved = matrix.shape[0], diagonal, in_order, sieved
+    def __init__(self, matrix, right, numbers, diagonal=False, in_order=False):
+        n, self.diagonal, self.in_order = matrix.shape[0], diagonal, in_order
         scaled = np.moveaxis(equilibrate(np.moveaxis(numbers, 2, 0))[0], 0, 2).astype(float)
         entries = list(zip(*matrix.sparsity().get_triplet(), matrix.nonzeros(), strict=True))
-        doubtful = [(i, j, entry) for i, j, entry in entries if sieved and not scaled[i, j].any()]
+        doubtful = [(i, j, entry) for i, j, entry in entries if not scaled[i, j].any()]
         vanishing = identical_zeros([entry for _, _, entry in doubtful])
         zeros = {(i, j) for (i, j, _), zero in zip(doubtful, vanishing, strict=True) if zero}
         self.rows = [{} for _ in range(n)]
@@ -341,7 +376,7 @@ class _System:
                 continue
             old, old_number = row.get(c, (_ZERO, 0.0))
             left, numbers = subtract(old, multiply(factor, a)), _difference(old_number, factor_number * a_number)
-            if self.sieved and not numbers.any() and identical_zeros([left])[0]:
+            if not numbers.any() and identical_zeros([left])[0]:
                 if row.pop(c, None) is not None:
                     del self.members[c][r]
             else:

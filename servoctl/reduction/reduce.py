@@ -19,7 +19,7 @@ from servoctl.reduction.manifold import (
     sample,
     sizes_of_references,
 )
-from servoctl.reduction.ranks import Rank, clean, decide_all, eliminate, pivot_order
+from servoctl.reduction.ranks import Rank, clean, decide_all, eliminate, orthogonal
 from servoctl.reduction.realisation import desired_actuation, desired_balance, realisation
 from servoctl.reduction.rows import Balance, as_rows, balances, merge_uses, omitted, settle_rows
 from servoctl.reduction.scales import usual
@@ -51,7 +51,7 @@ class Reduction(Packed):
     context: Context
     original: dict  # rows of the designer's residuals and material constraints, by name
     cascade: Cascade | None = None  # the rows by blocks, where they are deep
-    order: tuple = ()  # row and column of each pivot of the leading matrix; empty if they are chosen at the points
+    orthogonal: bool = False  # whether systems are solved by orthogonal rows, without a choice of pivots
 
     def __repr__(self):
         rows = ", ".join(f"{row.name} {row.order}" for row in self.rows)
@@ -129,18 +129,14 @@ class Reduction(Packed):
 
     def solve(self, right):
         """L⁻¹ right, and the pivots of L."""
-        return eliminate(self.leading, right, clean(*self.points.matrix(self.leading)), order=self.order)
+        return self.solved(self.leading, right)
 
-    def order_at(self, t, jets, values):
-        """Pivots of L, or of its blocks, chosen at jets (nz,) of an instant t (1, 1 + R), with these parameters."""
-        here = self.points.at(t, jets[:, None], values)
-        if self.cascade is not None:
-            return self.cascade.order_at(here, self.top - 1 if self.free else 0, self.top)
-        return pivot_order(self.leading, clean(*here.matrix(self.leading)), sieved=False)
-
-    def with_order(self, order):
-        """The reduction with other pivots, as `order_at` chooses them."""
-        return replace(self, order=order, cascade=self.cascade and self.cascade.with_order(order))
+    def solved(self, matrix, right, order=()):
+        """The solution of a system of the motion, and its pivots, in an order if one is given and they are chosen."""
+        numbers = clean(*self.points.matrix(matrix))
+        if self.orthogonal:
+            return orthogonal(matrix, right, numbers)
+        return eliminate(matrix, right, numbers, order=order)
 
     @cached_property
     def full(self):

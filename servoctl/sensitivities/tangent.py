@@ -17,7 +17,6 @@ import numpy as np
 
 from servoctl.codegen.function import compiled
 from servoctl.model.equations import SIGNALS
-from servoctl.reduction.ranks import clean, eliminate
 from servoctl.spec.references import Jets
 
 
@@ -73,7 +72,7 @@ class Tangent:
         rows = rows if j else ca.vertcat(rows, *e.q.invariants.values())
         matrix = ca.jacobian(rows, e.q.jet(j))
         right = -self.along(rows, [e.q.jet(i) for i in range(j)], known[:j])
-        return eliminate(matrix, right, clean(*e.r.points.matrix(matrix)))[0]
+        return e.r.solved(matrix, right)[0]
 
     def along(self, expressions, jets, tangents):
         """The derivatives (m, K) of expressions (m,) along tangents of jets, and by the parameters."""
