@@ -11,7 +11,8 @@ import servoctl as sv
 from servoctl.codegen import compiler
 from servoctl.gallery import gallery
 from servoctl.jets.tape import Plan
-from servoctl.methods.monitor import Monitor
+from servoctl.methods.motion import Stepping
+from servoctl.methods.rank import Rank
 from servoctl.methods.taylor import series_loop
 from servoctl.model import model as models
 from servoctl.model import store
@@ -240,16 +241,16 @@ def test_runs_with_other_pivots_are_saved_and_pickled(which, tmp_path):
 def test_a_start_at_which_the_same_rows_have_no_pivots_is_derived_again(monkeypatch):
     """A symmetric stance: rows that divide by a choice of actuators have no value there, whatever solves them."""
     model, start = begun("ideal point")
-    usual, chosen, repivoted = sv.simulate(model, start, (0.0, 0.5), "DOP853"), [], Monitor.repivoted
+    usual, chosen, repivot = sv.simulate(model, start, (0.0, 0.5), "DOP853"), [], Stepping._repivot
 
-    def noted(monitor, t, x, top):
-        chosen.append(monitor.model.reduction.orthogonal)
-        return repivoted(monitor, t, x, top)
+    def noted(stepping, t, x):
+        chosen.append(stepping.model.reduction.orthogonal)
+        return repivot(stepping, t, x)
 
     without = iter([True, False])
-    monkeypatch.setattr(Monitor, "repivoted", noted)
-    monkeypatch.setattr(Monitor, "bad_choice", lambda *_: True)
-    monkeypatch.setattr(Monitor, "without_value", lambda *_: next(without, False))
+    monkeypatch.setattr(Stepping, "_repivot", noted)
+    monkeypatch.setattr(Rank, "bad_choice", lambda *_: True)
+    monkeypatch.setattr(Rank, "without_value", lambda *_: next(without, False))
     run = sv.simulate(model, start, (0.0, 0.5), "DOP853")
     assert chosen[:2] == [False, True] and run.success
     assert np.abs(run.jets - usual.jets).max() < 1e-6 * np.abs(usual.jets).max()

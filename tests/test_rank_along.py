@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 import servoctl as sv
 from servoctl.gallery import gallery
 from servoctl.methods.bulk import BulkSteps
+from servoctl.methods.choice import as_method
 from servoctl.methods.lost_rank import singular
 from servoctl.methods.pieces import DEFAULT, Tolerance
 from servoctl.methods.rank import DEGRADED, Fine, Rank, Singular, Stretch, Weak
@@ -198,3 +199,86 @@ def test_steps_that_miss_the_equations_where_the_rank_is_lost_end_the_motion(mon
     with pytest.raises(sv.errors.SingularProgram) as error:
         sv.simulate(model, model.start(x=1.0, y=0.0, dx=8.0), (0.0, 4.0), "DOP853")
     assert error.value.details["t"] == pytest.approx(19 / 8, abs=1e-3) and tries
+
+
+def a_turn_at_low_speed(least):
+    """A particle whose velocity is (t - 1, least): the gradient of its squared speed is least at 1 s."""
+    q = sv.coordinates("x y")
+    dx, dy = q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    rows = {"speed": dx**2 + dy**2 - least**2 - (q.t - 1.0) ** 2, "direction": least * dx - (q.t - 1.0) * dy}
+    model = sv.derive(mechanism, sv.Program(rows, by="ideal"))
+    return model, model.start(x=0.0, y=0.0, guess={"dx": -1.0, "dy": least})
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA", "RK4"])
+@pytest.mark.parametrize("least", [1e-2, 1e-3, 1e-4])
+def test_a_gradient_that_nearly_vanishes_is_passed(least, method):
+    model, start = a_turn_at_low_speed(least)
+    run = sv.simulate(model, start, (0.0, 2.0), method, t_eval=np.linspace(0.0, 2.0, 21))
+    velocity = np.array([run.t - 1.0, np.full(21, least)])
+    np.testing.assert_allclose([run["dx"], run["dy"]], velocity, atol=1e-7)
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA", "LSODA", "RK4"])
+def test_a_gradient_that_vanishes_and_comes_back_is_lost(method):
+    """The squared speed is (t - 1)²: beyond 1 s nothing says where the particle turns."""
+    q = sv.coordinates("x y")
+    dx, dy = q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    model = sv.derive(mechanism, sv.Program({"speed": dx**2 + dy**2 - (q.t - 1.0) ** 2}, by="ideal"))
+    with pytest.raises(sv.errors.SingularProgram) as error:
+        sv.simulate(model, model.start(x=0.0, y=0.0, dx=-1.0, dy=0.0), (0.0, 2.0), method)
+    assert error.value.details["t"] == pytest.approx(1.0, abs=1e-5)
+
+
+def arm_to_its_reach(gap, by_rates):
+    """A 2R arm of links of 1 m whose tip comes as near as `gap` to the edge of its reach, at 1 s; and its start."""
+    q = sv.coordinates("a b")
+    (a, b), (da, db) = q, q.d(1)
+    tip = ca.vertcat(ca.cos(a) + ca.cos(a + b), ca.sin(a) + ca.sin(a + b))
+    elbow = ca.vertcat(ca.cos(a), ca.sin(a))
+    gibbs = sv.particle(q, 1.0, elbow) + sv.particle(q, 1.0, tip)
+    mechanism = sv.Mechanism(q, gibbs=gibbs, actuators={"u1": a, "u2": b})
+    r, angle = 2.0 - gap - 0.3 * (q.t - 1.0) ** 2, 0.2 * q.t
+    velocity = ca.jacobian(tip, ca.vertcat(a, b)) @ ca.vertcat(da, db)
+    rates = {
+        "radius": ca.dot(tip, velocity) + 0.6 * (q.t - 1.0) * r,
+        "angle": tip[0] * velocity[1] - tip[1] * velocity[0] - 0.2 * ca.sumsqr(tip),
+    }
+    places = {"x": tip[0] - r * ca.cos(angle), "y": tip[1] - r * ca.sin(angle)}
+    model = sv.derive(mechanism, sv.Program(rates if by_rates else places), guess={"a": -0.5, "b": 1.0})
+    bent = np.arccos((1.7 - gap) ** 2 / 2.0 - 1.0)
+    start = {"a": -bent / 2.0, "b": bent}
+    return model, model.start(**start) if by_rates else model.start(guess=start), bent
+
+
+REACHES = [(False, None, 1e-4), *((True, method, 1e-4) for method in ("Taylor", "DOP853", "RadauIIA", "LSODA"))]
+
+
+@pytest.mark.parametrize(("by_rates", "method", "within"), REACHES)
+def test_an_arm_that_nearly_reaches_its_edge_turns_and_one_beyond_it_ends_there(by_rates, method, within):
+    method = method and as_method(method, rtol=1e-9, atol=1e-11)
+    for gap in (1e-3, 1e-5, 1e-7):
+        model, start, bent = arm_to_its_reach(gap, by_rates)
+        assert sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, 2.0])["b"][-1] == pytest.approx(bent, abs=within)
+    for gap in (-1e-6, -1e-3):
+        model, start, _ = arm_to_its_reach(gap, by_rates)
+        with pytest.raises(sv.errors.SingularProgram) as error:
+            sv.simulate(model, start, (0.0, 2.0), method)
+        assert error.value.details["t"] == pytest.approx(1.0 - np.sqrt(-gap / 0.3), abs=2e-6)
+
+
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA"])
+@pytest.mark.parametrize("knot", [1.0, 1.0 - 1e-7, 1.0 + 1e-7, 1.0 - 1e-3])
+def test_a_zero_at_or_beside_the_end_of_a_step_is_located(knot, method):
+    """(x - 1) y' = x - 1 + (x - 1)² at x = t: the gradient is zero at 1 s, and y' = x has a limit there."""
+    q = sv.coordinates("x y")
+    (x, _), (dx, dy) = q, q.d(1)
+    mechanism = sv.Mechanism(q, gibbs=ca.sumsqr(ca.vertcat(*q.d(2))) / 2)
+    rows = {"pace": dx - 1.0, "row": (x - 1.0) * (dy - x)}
+    model = sv.derive(mechanism, sv.Program(rows, by="ideal"))
+    start = model.start(x=0.0, y=0.0)
+    with pytest.raises(sv.errors.SingularProgram) as error:
+        sv.simulate(model, start, (0.0, 2.0), method, t_eval=[0.0, knot, 2.0])
+    assert error.value.details["t"] == pytest.approx(1.0, abs=1e-6)

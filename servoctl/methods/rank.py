@@ -233,67 +233,43 @@ class Rank:
 
     def inspect(self, stretch):
         """Inspect steps that continue the inspected ones: Fine, Weak or Singular."""
-        n_g, count, _ = stretch.pivots.shape
+        count = stretch.pivots.shape[1]
         before, self.before = self.before, stretch
-        t = (stretch.t[:-1, None] + np.diff(stretch.t)[:, None] * stretch.parts).ravel()
-        if not stretch.pivots.size or self._all_strong(t, stretch.pivots.reshape(n_g, -1)):
+        if not stretch.pivots.size:
             return Fine(count)
         pole = self._pole(stretch)
         if pole is not None:
             return pole
-        doubtful, changed, least = self._relative(t, stretch.pivots)
+        doubtful, changed, least = self._doubtful(stretch)
         for k in map(int, np.flatnonzero(doubtful)):
             found = self._singular(stretch, k, before) or self._weak(stretch, k, changed[:, k], least[:, k])
             if found is not None:
                 return found
         return Fine(count)
 
-    def _all_strong(self, t, pivots):
-        """Whether pivots (n_g, N) at t (N,) keep their signs, and are so large that no step needs to be inspected."""
-        last, sizes = self.recent[1][:, -1], np.abs(pivots)
-        largest = np.maximum(sizes.max(axis=1), self.reference)
-        weakest = np.minimum((pivots * np.sign(last)[:, None]).min(axis=1), np.abs(last))
-        usual = np.maximum(self.reference, pivot_sizes(self.model))
-        if not ((weakest > DEGRADED * largest).all() and (NEGLIGIBLE * largest <= usual).all()):
-            return False
-        if self._turns(t, pivots).any():
-            return False
-        self._accept(t, pivots, largest)
-        return True
-
-    def _turns(self, t, pivots):
-        """Whether pivots (n_g, N) at t (N,) that have no sign may have been zero at or before each instant, (N,)."""
-        if not self.model.reduction.orthogonal:
-            return np.zeros(len(t), dtype=bool)
-        before, sizes = self.recent[0], np.abs(np.column_stack([self.recent[1], pivots]))
-        turned = may_vanish(np.append(before, t), sizes).any(axis=0)[-len(t) - 1 :]
-        turned = np.append(np.zeros(len(t) + 1 - len(turned), dtype=bool), turned)
-        return turned[:-1] | turned[1:]
-
-    def _accept(self, t, pivots, largest):
-        """Take in pivots (n_g, N) at t (N,), up to which these are the largest."""
-        before, known = self.recent
-        self.recent = np.append(before, t)[-2:], np.column_stack([known, pivots])[:, -2:]
-        self.reference = largest
-
-    def _relative(self, t, pivots):
+    def _doubtful(self, stretch):
         """Which steps are doubtful (S,); whether pivots change their signs in them, and their least sizes, (n_g, S).
 
-        Sizes are relative to the largest so far; what is not finite has none.
+        Sizes are relative to the largest so far; what is not finite has none. A pivot without a sign, as there is no
+        choice of pivots, may have been zero beside a least one.
         """
-        n_g, count, m = pivots.shape
-        inner = pivots.reshape(n_g, -1)
-        track = np.nan_to_num(np.column_stack([self.recent[1][:, -1], inner]), posinf=0.0, neginf=0.0)
+        (before, known), (n_g, count, m) = self.recent, stretch.pivots.shape
+        t = np.append(before, stretch.t[:-1, None] + np.diff(stretch.t)[:, None] * stretch.parts)
+        track = np.nan_to_num(np.column_stack([known, stretch.pivots.reshape(n_g, -1)]), posinf=0.0, neginf=0.0)
         sizes = np.abs(track)
-        sizes[:, 0] = np.maximum(sizes[:, 0], self.reference)
-        largest = np.maximum.accumulate(sizes, axis=1)
-        relative = track / np.where(largest > 0, largest, 1.0)
-        signs, sizes = np.sign(relative), np.abs(relative)
-        changed = (signs[:, :-1] * signs[:, 1:] < 0).reshape(n_g, count, m).any(axis=2)
-        least = np.minimum(sizes[:, 1:].reshape(n_g, count, m).min(axis=2), sizes[:, :-1:m])
-        turned = self._turns(t, track[:, 1:]).reshape(count, m).any(axis=1)
-        self._accept(t, track[:, 1:], largest[:, -1])
-        return turned | (changed | (least < DEGRADED)).any(axis=0), changed, least
+        largest = np.maximum(np.maximum.accumulate(sizes, axis=1), self.reference[:, None])
+        relative, turned = sizes / np.where(largest > 0, largest, 1.0), np.zeros(len(t), dtype=bool)
+        if self.model.reduction.orthogonal:
+            beside = may_vanish(t, sizes).any(axis=0)
+            turned[1:-1] |= beside
+            turned[2:] |= beside
+        self.recent, self.reference = (t[-2:], track[:, -2:]), largest[:, -1]
+        first, signs = len(before), np.sign(track)
+        changed = (signs[:, :-1] * signs[:, 1:] < 0)[:, first - 1 :].reshape(n_g, count, m).any(axis=2)
+        inner = relative[:, first:].reshape(n_g, count, m)
+        least = np.minimum(inner.min(axis=2), relative[:, first - 1 : -1 : m])
+        weak = (changed | (least < DEGRADED)).any(axis=0)
+        return weak | turned[first:].reshape(count, m).any(axis=1), changed, least
 
     def _pole(self, stretch):
         """Singular where a pivot grows without bound in one step, as that of a row divided by a speed that vanishes."""
@@ -332,11 +308,14 @@ class Rank:
         zeros = [t for i, t, allowed in places if not along.value(t)[i] > allowed + self._doubt(t, along)[i]]
         if not zeros and signs[0] * signs[1] < 0:
             zeros = [min((t for _, t, _ in places), key=lambda t: along.value(t).min(), default=along.span[1])]
-        if zeros:
-            return Singular(k, zeros[0], along.state(zeros[0]), zeros[0], VANISHES)
-        stays = (along.sizes <= self._doubt(along.span[1], along)[:, None]).all(axis=1)
-        at = along.zero(int(np.argmax(stays)))
-        return Singular(k, stretch.t[k], stretch.x[:, k], at, VANISHES) if stays.any() else None
+        if not zeros:
+            stays = (along.sizes <= self._doubt(along.span[1], along)[:, None]).all(axis=1)
+            zeros = [along.zero(i) for i in np.flatnonzero(stays)]
+        if not zeros:
+            return None
+        inside = (zeros[0] - along.span[0]) * (zeros[0] - along.span[1]) < 0
+        t = zeros[0] if inside else along.span[0]
+        return Singular(k, t, along.state(t), zeros[0], VANISHES)
 
     def _doubt(self, t, along):
         """By how much the least singular values at an instant may be wrong as the state is, (2,).

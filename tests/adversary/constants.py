@@ -1,6 +1,6 @@
 """Constants that decide, ten times larger and ten times smaller: do tests see it?
 
-`python tests/adversary/constants.py methods/monitor.py HIDES SHARE --tests test_monitor.py` prints a line for each
+`python tests/adversary/constants.py methods/rank.py LOST HELPS --tests test_stops.py` prints a line for each
 value. A test that fails pins the constant from that side; tests/pinned.txt names it.
 """
 
