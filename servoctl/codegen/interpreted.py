@@ -105,7 +105,7 @@ class Interpreter:
 
     def __init__(self, f, project=None, sizes=None, settled=None):
         self._f, self._n_x, self._project, self._sizes, self._settled = f, f.numel_in(1), project, sizes, settled
-        self._parts, self._points = (1, self._n_x, f.numel_in(2), f.numel_out(0)), 0
+        self._parts, self._points, self._machine = (1, self._n_x, f.numel_in(2), f.numel_out(0)), 0, None
         self.workspace = Workspace(*self._parts[1:], self._connect)
 
     def _connect(self, row, parts):
@@ -138,7 +138,7 @@ class Interpreter:
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
         self._points += t.size
-        if self._points >= MANY_POINTS and t.size >= ENOUGH and self._machine is not None:
+        if self._points >= MANY_POINTS and t.size >= ENOUGH and self._by_machine(t.size):
             self._machine.grid(t, x, with_jets(self._f, t, p), y)
             return
         left = t.size % BLOCK
@@ -167,10 +167,11 @@ class Interpreter:
     def _blocks(self):
         return Blocks(self._block, self._parts, self._connected)
 
-    @functools.cached_property
-    def _machine(self):
-        """Evaluation of many points in C; None where it cannot."""
-        return machine(self._f, self._points // BLOCK)
+    def _by_machine(self, points):
+        """Whether so many points are evaluated in C."""
+        if self._machine is None:
+            self._machine = machine(self._f, points / BLOCK)
+        return self._machine
 
     @functools.cached_property
     def _block(self):

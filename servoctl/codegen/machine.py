@@ -17,14 +17,14 @@ ENOUGH = 4  # points that are worth a block: CasADi evaluates fewer of them one 
 
 
 def machine(f, calls):
-    """The `Machine` of an SX function (t, x, p) -> y; None without a compiler, or where an operation is no arithmetic.
+    """The `Machine` of an SX function (t, x, p) -> y; False where an operation is no arithmetic, None where not compiled.
 
-    CasADi has its own approximation of the inverse error function.
+    CasADi has its own approximation of the inverse error function. `calls` are evaluations that it would replace.
     """
-    used = {f.instruction_id(k) for k in range(f.n_instructions())}
-    if not used <= emit.SAME_BITS or (library := _operations(calls)) is None:
+    if (library := compiler.library(_written(TOGETHER), "-O3", True, calls)) is None:
         return None
-    return Machine(f, library.servoctl_machine)
+    used = {f.instruction_id(k) for k in range(f.n_instructions())}
+    return used <= emit.SAME_BITS and Machine(f, library.servoctl_machine)
 
 
 class Machine:
@@ -59,8 +59,3 @@ class Machine:
 
 
 _written = functools.cache(emit.emit_machine)
-
-
-def _operations(calls):
-    """The library of the unit; None without a compiler."""
-    return compiler.library(_written(TOGETHER), "-O3", True, calls) if compiler.compiler() else None

@@ -7,9 +7,7 @@ NumPy where there is no compiler. Both have the same bits.
 """
 
 import ctypes
-import os
 import weakref
-from functools import cache, cached_property
 
 import casadi as ca
 import numpy as np
@@ -40,7 +38,7 @@ class Followed:
             places = (array.ctypes.data for array in arrays)
             rows.append((pieces, size, size, RULES[path.before], RULES[path.after], *path.rests, *places))
         self._table = np.array(rows, dtype=np.int64).reshape(-1, 9)
-        self.address, self._last = float(self._table.ctypes.data), (None, None)
+        self.address, self._last, self._library = float(self._table.ctypes.data), (None, None), None
         _alive[self.address] = self
 
     def jets(self, t, order, instant=None):
@@ -59,6 +57,7 @@ class Followed:
 
     def _evaluated(self, t, order, instants):
         """As `jets`."""
+        self._library = self._library or compiler.library(IN_C, "-O2", exact=True, calls=1)
         if self._library is None:
             jets, known = np.full((order + 1, len(self.paths), len(t)), np.nan), np.isfinite(t) & np.isfinite(instants)
             for i, path in enumerate(self.paths):
@@ -71,16 +70,6 @@ class Followed:
             ctypes.c_double(self.address), *sizes, *(ctypes.c_void_p(a.ctypes.data) for a in arrays)
         )
         return jets.T
-
-    @cached_property
-    def _library(self):
-        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _of_paths(compiler.compiler())
-
-
-@cache
-def _of_paths(command):
-    """The library of paths.c by the compiler that a command calls; None without one."""
-    return compiler.library(IN_C, "-O2", exact=True, calls=0) if command else None
 
 
 def followed(address):
