@@ -1,6 +1,7 @@
 """From a model and a start to a run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -146,7 +147,7 @@ def simulate(
     model, start = _model_and_start(model, start, inputs)
     span = as_span(t_span)
     others = {"events": as_events(events), "progress": progress, "max_step": max_step}
-    with fixed(compiled):
+    with nullcontext() if compiled is None else fixed(compiled):
         return _with_verdict(model, start, span, (method, drift, accuracy), {"t_eval": t_eval, **others})
 
 

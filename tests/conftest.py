@@ -64,7 +64,7 @@ def uncompiled(monkeypatch):
 @pytest.fixture(params=("c", "casadi"))
 def backend(request, monkeypatch):
     """Compiled code in every grid and loop, and CasADi where there is no compiler."""
-    monkeypatch.setattr(function, "GRID_POINTS", 0)
+    monkeypatch.setattr(function, "MANY_POINTS", 0)
     request.getfixturevalue("c_compiler" if request.param == "c" else "uncompiled")
     return request.param
 

@@ -2,8 +2,8 @@
 
 What is on disk is used at once; anything else is compiled when its evaluations in this process have taken as long as
 compiling takes. A library lies in the cache directory under the hash of its C text, or of what this is written from, of
-the sources that write it and the files that it may include, the compiler and the processor. The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a
-warning says where a named one does not exist.
+the sources that write it and the files that it may include, the compiler and the processor. The compiler is
+``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a warning says where a named one is missing.
 ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, CasADi evaluates instead, and the
 process warns once, unless none was chosen.
 
@@ -53,8 +53,8 @@ class _CompilerFailed(Exception):
 
 @contextlib.contextmanager
 def fixed(compiled):
-    """While this holds, libraries are compiled at their first use (True) or not used (False); None changes nothing."""
-    if not any(compiled is known for known in (None, True, False)):
+    """While this holds, libraries are compiled at their first use (True), or not used (False)."""
+    if compiled is not True and compiled is not False:
         raise SpecificationError(
             f"compiled={compiled!r} was given.",
             "It is True, False or None.",
@@ -62,7 +62,7 @@ def fixed(compiled):
             do="Leave it out: what is on disk is used, and the rest compiled where that pays.",
             compiled=compiled,
         )
-    token = choice.set(choice.get() if compiled is None else compiled)
+    token = choice.set(compiled)
     try:
         yield
     finally:
@@ -72,14 +72,14 @@ def fixed(compiled):
 def library(text, level="-O1", exact=False, calls=math.inf, emitted=None):
     """Load the library of a C translation unit, by which `calls` evaluations would be made now.
 
-    Where it is not on disk it is compiled once the evaluations for which this process has asked make up for that, and
-    None until then; None, too, without a compiler or if compiling failed (one warning per process, unless none was
-    chosen). `emitted` returns C text and level where `text` only stands for them. `level` may have further flags behind
-    it, which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is at
+    Where it is not on disk it is compiled once the calls that this process has told make up for that, and None until
+    then; None, too, without a compiler or if compiling failed (one warning per process, unless none was chosen).
+    `emitted` returns C text and level where `text` only stands for them. `level` may have further flags behind it,
+    which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is at
     most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
     """
     command, identity = _compiler()
-    if command is None and (choice.get() is False or os.environ.get("SERVOCTL_COMPILER") == "none"):
+    if choice.get() is False or os.environ.get("SERVOCTL_COMPILER") == "none":
         return None
     key = hashlib.sha256("\0".join((text, level, str(exact), digest(), _machine(identity))).encode()).hexdigest()
     with _guard:

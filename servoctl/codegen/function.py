@@ -17,12 +17,12 @@ import numpy as np
 
 from servoctl.codegen import compiler, emit
 from servoctl.codegen.compiler import CALLS
-from servoctl.codegen.interpreted import BLOCK, Interpreter, restored, restored_grid, weighted
+from servoctl.codegen.interpreted import BLOCK, MANY_POINTS, Interpreter, restored, restored_grid, weighted
 from servoctl.codegen.native import Library, builtin
+from servoctl.codegen.paths import none_chosen
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import contains
 
-GRID_POINTS = 2_500  # 20 longer grids take CasADi as long as loading a library
 STEP = 6  # evaluations that take as long as what surrounds that of a Taylor step in Python
 FULLY_OPTIMISED = 6_000  # statements of C: up to here -O3 takes at most 1.5 s; more are as fast with -O1
 ALONG_A_PATH = "-O2 -fno-tree-pre -fno-tree-vrp -fno-gcse -fno-tree-slp-vectorize"  # Newton: 3/4 of the time of -O3
@@ -155,8 +155,8 @@ class Compiled:
         t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
         p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
         y = np.empty((self.n_y, n))
-        self._in_loops["_lanes" if n > GRID_POINTS else "_library"] += n / BLOCK
-        (self._lanes if n > GRID_POINTS else self._library if self.loops else self._interpreter).grid(t, x, p, y)
+        self._in_loops["_lanes" if n > MANY_POINTS else "_library"] += n / BLOCK
+        (self._lanes if n > MANY_POINTS else self._library if self.loops else self._interpreter).grid(t, x, p, y)
         return y
 
     def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
@@ -218,8 +218,8 @@ class Compiled:
         t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
         nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
         z = np.empty((self.n_y - self.sizes.get("pivots", 0), t.size))
-        self._in_loops["_library"] += t.size
         n, iterations = self._library.newton(t, nodes, p, z)
+        self._in_loops["_library"] += iterations if n < BLOCK else iterations / BLOCK + n % BLOCK
         return z[:, :n], iterations
 
     def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
@@ -334,7 +334,7 @@ class Compiled:
         found = vars(self).get(name)
         if compiler.choice.get() is False:
             return self._interpreter
-        if found is None and (calls := self._in_loops[name]):
+        if found is None and (calls := self._in_loops[name]) and not none_chosen():
             self._in_loops[name] = 0
             identity, emitted = f"{name} {FULLY_OPTIMISED} {self.identity}", functools.partial(self._emitted, name)
             if (library := compiler.library(identity, calls=calls, emitted=emitted)) is not None:

@@ -22,10 +22,10 @@ from servoctl.codegen.loops import (
     STEADY,
 )
 from servoctl.codegen.machine import ENOUGH, machine
-from servoctl.codegen.paths import evaluated, jets_at, jets_in, with_jets
+from servoctl.codegen.paths import evaluated, jets_at, jets_in, none_chosen, with_jets
 
 BLOCK = 128  # instants of a path that are solved together
-MANY_POINTS = 2_000  # of them CasADi takes longer, one by one, than writing the list of operations takes
+MANY_POINTS = 2_000  # one by one, of which CasADi takes longer than writing a list of operations or loading a library
 
 _guard = threading.Lock()
 
@@ -169,8 +169,8 @@ class Interpreter:
 
     def _by_machine(self, points):
         """Whether so many points are evaluated in C."""
-        if self._machine is None:
-            self._machine = machine(self._f, points / BLOCK)
+        if self._machine is None and not none_chosen():
+            self._machine = machine(self._f, points)
         return self._machine
 
     @functools.cached_property
@@ -288,13 +288,20 @@ class Interpreter:
             h, (begin, end) = min(h, longest), next(pieces, (None, None)) if t == end else (begin, end)
         return k, path.count
 
+    def _blockwise(self, parts):
+        """The call of the function on arrays (BLOCK, n) of t, x, p and y, and what must live as long as it."""
+        if not self._by_machine(BLOCK):
+            return self._connected(self._block, parts)
+        t, x, p, y = (part.T for part in parts)
+        return lambda: self._machine.grid(t, x, with_jets(self._f, t, p[:, 0]), y), None
+
     @np.errstate(all="ignore")
     def newton(self, t, nodes, p, z):
         """Fill columns of z; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         path, k, alone = self._path(p), 0, 0
         (_, n_x, _, n_y), rows = self._parts, len(z)
         parts = np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, n_y))
-        call = self._connected(self._block, parts) if t.size >= BLOCK else None
+        call = self._blockwise(parts) if t.size >= BLOCK else None
         forward = nodes[-1, 0] >= nodes[0, 0]
         ends = nodes[1:, 0] if forward else -nodes[1:, 0]
         first = np.minimum(np.searchsorted(ends, t if forward else -t), max(len(nodes) - 2, 0))

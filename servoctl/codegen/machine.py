@@ -11,16 +11,18 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
+from servoctl.codegen.compiler import CALLS
 
 TOGETHER = 64  # points of a block: the values of sixty operations stay in the first cache
 ENOUGH = 4  # points that are worth a block: CasADi evaluates fewer of them one by one in less time
 
 
-def machine(f, calls):
-    """The `Machine` of an SX function (t, x, p) -> y; False where an operation is no arithmetic, None where not compiled.
+def machine(f, points):
+    """The `Machine` of an SX function (t, x, p) -> y; False where not all is arithmetic, None while it is not compiled.
 
-    CasADi has its own approximation of the inverse error function. `calls` are evaluations that it would replace.
+    CasADi has its own approximation of the inverse error function. It would be used at so many points now.
     """
+    calls = points * f.n_instructions() / CALLS  # it is compiled for all functions, as long as one of so many
     if (library := compiler.library(_written(TOGETHER), "-O3", True, calls)) is None:
         return None
     used = {f.instruction_id(k) for k in range(f.n_instructions())}
