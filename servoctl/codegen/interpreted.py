@@ -288,9 +288,9 @@ class Interpreter:
             h, (begin, end) = min(h, longest), next(pieces, (None, None)) if t == end else (begin, end)
         return k, path.count
 
-    def _blockwise(self, parts):
+    def _blockwise(self, parts, points):
         """The call of the function on arrays (BLOCK, n) of t, x, p and y, and what must live as long as it."""
-        if not self._by_machine(BLOCK):
+        if not self._by_machine(points):
             return self._connected(self._block, parts)
         t, x, p, y = (part.T for part in parts)
         return lambda: self._machine.grid(t, x, with_jets(self._f, t, p[:, 0]), y), None
@@ -301,7 +301,7 @@ class Interpreter:
         path, k, alone = self._path(p), 0, 0
         (_, n_x, _, n_y), rows = self._parts, len(z)
         parts = np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, n_y))
-        call = self._blockwise(parts) if t.size >= BLOCK else None
+        call = self._blockwise(parts, t.size) if t.size >= BLOCK else None
         forward = nodes[-1, 0] >= nodes[0, 0]
         ends = nodes[1:, 0] if forward else -nodes[1:, 0]
         first = np.minimum(np.searchsorted(ends, t if forward else -t), max(len(nodes) - 2, 0))

@@ -59,7 +59,7 @@ class Followed:
     def _evaluated(self, t, order, instants):
         """As `jets`."""
         if self._library is None and not none_chosen():
-            self._library = compiler.library(IN_C, "-O2", exact=True, calls=1)
+            self._library = compiler.library(IN_C, "-O2", exact=True, calls=(order + 1) * len(self.paths))
         if self._library is None:
             jets, known = np.full((order + 1, len(self.paths), len(t)), np.nan), np.isfinite(t) & np.isfinite(instants)
             for i, path in enumerate(self.paths):
