@@ -29,6 +29,8 @@ class Followed:
     `address` is a number of p for as long as this object lives; `jets` has the derivatives at some instants.
     """
 
+    library = None  # of paths.c, the same for all paths; None while it is not compiled
+
     def __init__(self, paths):
         self.paths = tuple(paths)  # of one component each
         rows, self._arrays = [], []
@@ -39,7 +41,7 @@ class Followed:
             places = (array.ctypes.data for array in arrays)
             rows.append((pieces, size, size, RULES[path.before], RULES[path.after], *path.rests, *places))
         self._table = np.array(rows, dtype=np.int64).reshape(-1, 9)
-        self.address, self._last, self._library = float(self._table.ctypes.data), (None, None), None
+        self.address, self._last = float(self._table.ctypes.data), (None, None)
         _alive[self.address] = self
 
     def jets(self, t, order, instant=None):
@@ -58,9 +60,9 @@ class Followed:
 
     def _evaluated(self, t, order, instants):
         """As `jets`."""
-        if self._library is None and not none_chosen():
-            self._library = compiler.library(IN_C, "-O2", exact=True, calls=(order + 1) * len(self.paths))
-        if self._library is None:
+        if Followed.library is None and not none_chosen():
+            Followed.library = compiler.library(IN_C, "-O2", exact=True, calls=(order + 1) * len(self.paths))
+        if Followed.library is None or none_chosen():
             jets, known = np.full((order + 1, len(self.paths), len(t)), np.nan), np.isfinite(t) & np.isfinite(instants)
             for i, path in enumerate(self.paths):
                 jets[:, i, known] = path.jets(t[known], order, instants[known])[:, 0]
@@ -68,7 +70,7 @@ class Followed:
         jets = np.zeros((len(t), (order + 1) * len(self.paths)))
         arrays = *(np.ascontiguousarray(part, dtype=float) for part in (instants, t)), jets
         sizes = map(ctypes.c_int64, (len(self.paths), order, len(t)))
-        self._library.servoctl_paths(
+        Followed.library.servoctl_paths(
             ctypes.c_double(self.address), *sizes, *(ctypes.c_void_p(a.ctypes.data) for a in arrays)
         )
         return jets.T

@@ -34,9 +34,7 @@ def _in_turn(function, calls):
     """(key, result, None) of the calls, in this process."""
     with _recorded_interrupts() as interrupts:
         for key, arguments in calls.items():
-            with fixed(
-                True
-            ):  # the same bits in any order and on any worker
+            with fixed(True):  # the same bits in any order and on any worker
                 result = function(*arguments)
             if interrupts:
                 raise KeyboardInterrupt  # which `simulate` inside the function caught: it is the result of half a run
