@@ -19,6 +19,7 @@ from servoctl.codegen import cache, compiler
 from servoctl.codegen import function as functions
 from servoctl.codegen.compiler import CALLS
 from servoctl.codegen.function import MANY_POINTS, compiled
+from servoctl.codegen.paths import Followed
 from servoctl.errors import SpecificationError
 from servoctl.gallery import gallery
 from servoctl.model.equations import signal_groups
@@ -51,6 +52,7 @@ def pendulum_with_loops():
 def new_process(monkeypatch):
     monkeypatch.setattr(compiler, "_loaded", {})
     monkeypatch.setattr(compiler, "_calls", Counter())
+    monkeypatch.setattr(Followed, "library", None)
     monkeypatch.setattr(compiler, "_warned", False)
 
 
