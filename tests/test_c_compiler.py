@@ -111,6 +111,23 @@ def test_a_loop_is_compiled_when_its_evaluations_pay_for_that_and_used_at_once_w
     assert announced.backend == "c" and len(by_rule) == 2
 
 
+def test_evaluations_of_earlier_processes_count(by_rule, monkeypatch):
+    x, p, third = np.array([0.1, 0.0]), np.ones(1), CALLS // 12
+    backends = []
+    for _ in range(4):
+        model = pendulum_with_loops()
+        model.rk(0.0, x, 1e-3, third, p, RK4)
+        backends.append((model.backend, len(by_rule)))
+        compiler._tell()
+        new_process(monkeypatch)
+    assert backends == [("casadi", 0), ("casadi", 0), ("casadi", 0), ("c", 1)]
+    for told in compiler.cache_directory().glob("[0-9a-f]*[0-9a-f]"):
+        told.write_text("no number")
+    other = pendulum_with_loops()
+    other.rk(0.0, x, 1e-3, third, p, RK4)
+    assert other.backend == "c" and len(by_rule) == 1
+
+
 def test_steps_of_a_series_in_python_count_more_than_their_evaluations(by_rule):
     sizes = {"nq": 1, "n": 1, "top": 2, "last": 2, "plain": 1}
     model, steps = compiled(function(X2[1], -X2[0] / 2), "series", ("taylor",), sizes=sizes), 0

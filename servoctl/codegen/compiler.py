@@ -1,7 +1,7 @@
 """Libraries from C text: compiled by the system's compiler, stored on disk by content, loaded.
 
-What is on disk is used at once; anything else is compiled when its evaluations in this process have taken as long as
-compiling takes. A library lies in the cache directory under the hash of its C text, or of what this is written from, of
+What is on disk is used at once; anything else is compiled when its evaluations, in this process and in earlier ones, have
+taken as long as compiling takes. A library lies in the cache directory under the hash of its C text, or of what this is written from, of
 the sources that write it and the files that it may include, the compiler and the processor. The compiler is
 ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a warning says where a named one is missing.
 ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, CasADi evaluates instead, and the
@@ -72,8 +72,8 @@ def fixed(compiled):
 def library(text, level="-O1", exact=False, calls=math.inf, emitted=None):
     """Load the library of a C translation unit, by which `calls` evaluations would be made now.
 
-    Where it is not on disk it is compiled once the calls that this process has told make up for that, and None until
-    then; None, too, without a compiler or if compiling failed (one warning per process, unless none was chosen).
+    Where it is not on disk it is compiled once the calls that this process and earlier ones have told make up for that,
+    and None until then; None, too, without a compiler or if compiling failed (one warning per process, unless none was chosen).
     `emitted` returns C text and level where `text` only stands for them. `level` may have further flags behind it,
     which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is at
     most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
@@ -86,7 +86,8 @@ def library(text, level="-O1", exact=False, calls=math.inf, emitted=None):
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            first, _calls[key] = key not in _calls, _calls[key] + calls
+            first = key not in _calls
+            _calls[key] += calls + (_told(key) if first else 0)
             due = choice.get() or _calls[key] >= CALLS
             found = _open(cache_directory() / f"{key}.so") if command and (first or due) else None
             if found is None and not due:
@@ -95,6 +96,21 @@ def library(text, level="-O1", exact=False, calls=math.inf, emitted=None):
                 return _without("No C compiler was found")
             _loaded[key] = found or _build(*(emitted() if emitted else (text, level)), exact, f"{key}.so", command)
         return _loaded[key]
+
+
+def _told(key):
+    """The calls by which earlier processes would have used a library."""
+    with contextlib.suppress(OSError, ValueError):
+        return float(read_cached(cache_directory() / key))
+    return 0.0
+
+
+@atexit.register
+def _tell():
+    """Leave the calls of what was not compiled to the next process, for which it may pay."""
+    for key in _calls.keys() - _loaded.keys():
+        with contextlib.suppress(OSError), replacing(cache_directory() / key) as temporary:
+            Path(temporary).write_text(repr(_calls[key]), encoding="utf-8")
 
 
 def compiler():
