@@ -1,9 +1,10 @@
 """Libraries from C text: compiled by the system's compiler, stored on disk by content, loaded.
 
-What is on disk is used at once; anything else is compiled when its evaluations, in this process and in earlier ones, have
-taken as long as compiling takes. A library lies in the cache directory under the hash of its C text, or of what this is written from, of
-the sources that write it and the files that it may include, the compiler and the processor. The compiler is
-``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a warning says where a named one is missing.
+What is on disk is used at once; anything else is compiled when its evaluations, in this process and in earlier ones,
+have taken as long as compiling takes. A library lies in the cache directory under the hash of its C text, or of what
+this is written from, of the sources that write it and the files that it may include, the compiler and the processor.
+The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a warning says where a named
+one is missing.
 ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, CasADi evaluates instead, and the
 process warns once, unless none was chosen.
 
@@ -73,10 +74,10 @@ def library(text, level="-O1", exact=False, calls=math.inf, emitted=None):
     """Load the library of a C translation unit, by which `calls` evaluations would be made now.
 
     Where it is not on disk it is compiled once the calls that this process and earlier ones have told make up for that,
-    and None until then; None, too, without a compiler or if compiling failed (one warning per process, unless none was chosen).
-    `emitted` returns C text and level where `text` only stands for them. `level` may have further flags behind it,
-    which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is at
-    most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
+    and None until then; None, too, without a compiler or if compiling failed (one warning per process, unless none was
+    chosen). `emitted` returns C text and level where `text` only stands for them. `level` may have further flags behind
+    it, which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is
+    at most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
     """
     command, identity = _compiler()
     if choice.get() is False or os.environ.get("SERVOCTL_COMPILER") == "none":
