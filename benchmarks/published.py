@@ -557,7 +557,7 @@ def ours(problem, model, start, method):
     """A call, which returns the values at the end by name, and the run's message."""
 
     def call():
-        run = sv.simulate(model, start, (0.0, problem.until), method)
+        run = sv.simulate(model, start, (0.0, problem.until), method, compiled=True)
         return {name: float(run[name][-1]) for name in problem.truth()}, run.message
 
     return call

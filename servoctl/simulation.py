@@ -1,6 +1,7 @@
 """From a model and a start to a run."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from servoctl.checks import as_numbers, as_span, within
+from servoctl.codegen.compiler import fixed
 from servoctl.dense import up_to
 from servoctl.errors import InconsistentStart, ServoError, SpecificationError, warn
 from servoctl.growth import STEP_ERROR, internal_dynamics, quiet
@@ -77,6 +79,7 @@ def simulate(
     t_eval: ArrayLike | None = None,
     events: Mapping[str, object] | Sequence[object] | Event | Callable[..., float] | str | None = None,
     progress: bool | Callable[[float], object] | None = None,
+    compiled: bool | None = None,
 ) -> Run:
     """Simulate the motion that a program prescribes, or that of a plant under inputs.
 
@@ -121,6 +124,9 @@ def simulate(
     progress : bool or callable, optional
         Whether to show a bar; default: on a terminal, after a second. A callable receives the time reached [s]; an
         exception that it raises ends the simulation.
+    compiled : bool, optional
+        True compiles at once what is not on disk, False takes no compiled code; both give the same bits again. By
+        default what is on disk is used, and the rest compiled when the steps so far have made up for that.
 
     Returns
     -------
@@ -141,9 +147,16 @@ def simulate(
     model, start = _model_and_start(model, start, inputs)
     span = as_span(t_span)
     others = {"events": as_events(events), "progress": progress, "max_step": max_step}
+    with nullcontext() if compiled is None else fixed(compiled):
+        return _with_verdict(model, start, span, (method, drift, accuracy), {"t_eval": t_eval, **others})
+
+
+def _with_verdict(model, start, span, settings, others):
+    """The run of `simulated`, or the most accurate of several, with a verdict on its internal dynamics."""
+    method, drift, accuracy = settings
 
     def attempt(method, drift):
-        return simulated(model, start, span, method, t_eval=t_eval, drift=drift, **others)
+        return simulated(model, start, span, method, drift=drift, **others)
 
     judging = _has_internal_dynamics(model) and (method is None or as_method(method).forward)
     tolerance = getattr(method, "rtol", STEP_ERROR)

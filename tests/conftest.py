@@ -9,6 +9,7 @@ even imported. The third tier has the other cases of the functions in `tests/by_
 import os
 import sys
 import warnings
+from contextvars import ContextVar
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when casadi is imported; matrices are small, and threads would wait
@@ -31,6 +32,7 @@ from servoctl.model.points import place_of, with_place
 from servoctl.model.variants import derived_near
 
 os.environ["SERVOCTL_MEMO"] = "none"  # tests derive themselves what they test
+compiler.choice = ContextVar("compiled", default=True)  # and compare bits, so that loops are compiled at their first use
 FULLY_OPTIMISED, function.FULLY_OPTIMISED = function.FULLY_OPTIMISED, 0  # they compile much and run shortly: -O1
 with warnings.catch_warnings():  # of a CC that names no program
     warnings.simplefilter("ignore")
@@ -62,7 +64,7 @@ def uncompiled(monkeypatch):
 @pytest.fixture(params=("c", "casadi"))
 def backend(request, monkeypatch):
     """Compiled code in every grid and loop, and CasADi where there is no compiler."""
-    monkeypatch.setattr(function, "GRID_POINTS", 0)
+    monkeypatch.setattr(function, "MANY_POINTS", 0)
     request.getfixturevalue("c_compiler" if request.param == "c" else "uncompiled")
     return request.param
 

@@ -4,6 +4,8 @@ import os
 import subprocess
 import time
 import warnings
+from collections import Counter
+from contextvars import ContextVar
 
 import casadi as ca
 import numpy as np
@@ -15,7 +17,10 @@ from test_compiled_functions import P1, RK4, X2, T, function, numpy_rk4, pendulu
 import servoctl as sv
 from servoctl.codegen import cache, compiler
 from servoctl.codegen import function as functions
-from servoctl.codegen.function import GRID_POINTS, compiled
+from servoctl.codegen.compiler import CALLS
+from servoctl.codegen.function import MANY_POINTS, compiled
+from servoctl.codegen.paths import Followed
+from servoctl.errors import SpecificationError
 from servoctl.gallery import gallery
 from servoctl.model.equations import signal_groups
 from servoctl.shell.main import main
@@ -32,6 +37,13 @@ def fresh(tmp_path, monkeypatch, c_compiler):
     return commands
 
 
+@pytest.fixture
+def by_rule(fresh, monkeypatch):
+    """As users have it: no call says whether it is compiled."""
+    monkeypatch.setattr(compiler, "choice", ContextVar("compiled", default=None))
+    return fresh
+
+
 def pendulum_with_loops():
     """Rates of a pendulum; as a Newton step they vanish at once where it hangs."""
     return compiled(function(X2[1], -P1 * ca.sin(X2[0]), 0, 0, 0, 0), "hanging", ("rk", "newton"))
@@ -39,6 +51,8 @@ def pendulum_with_loops():
 
 def new_process(monkeypatch):
     monkeypatch.setattr(compiler, "_loaded", {})
+    monkeypatch.setattr(compiler, "_calls", Counter())
+    monkeypatch.setattr(Followed, "library", None)
     monkeypatch.setattr(compiler, "_warned", False)
 
 
@@ -46,7 +60,7 @@ def test_points_and_short_grids_compile_no_function_however_many(fresh):
     for model in (pendulum(), compiled(function(X2[1], -P1 * X2[0]), "spring")):
         for _ in range(200):
             model(0.0, [0.1, 0.2], [1.0])
-            model.grid(0.0, np.zeros((2, GRID_POINTS)), [1.0])
+            model.grid(0.0, np.zeros((2, MANY_POINTS)), [1.0])
         assert len(fresh) == 1 and model.backend == "casadi"  # the unit that takes the operations of any function
 
 
@@ -63,7 +77,7 @@ def test_points_called_ten_thousand_times_are_compiled(fresh):
 
 def test_a_long_grid_is_compiled(fresh):
     model = pendulum()
-    model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0])
+    model.grid(0.0, np.zeros((2, MANY_POINTS + 1)), [1.0])
     assert len(fresh) == 1 and model.backend == "c"
 
 
@@ -79,18 +93,80 @@ def test_what_an_integration_uses_is_compiled_at_its_first_use(fresh, use):
     assert len(fresh) == 1
 
 
-def test_a_command_compiles_what_it_calls_often_and_reads_what_is_there(fresh, monkeypatch):
-    model, other, x, p = pendulum_with_loops(), pendulum_with_loops(), np.zeros(2), np.ones(1)
-    with compiler.once(100):
-        few = [model.rk(0.0, x + 0.1, 0.01, 12, p, RK4)[1] for _ in range(2)]  # four evaluations a step
-        assert not fresh and model.backend == "casadi"
-        model.rk(0.0, x, 0.01, 12, p, RK4)
-        assert len(fresh) == 1 and model.backend == "c"
+def test_a_loop_is_compiled_when_its_evaluations_pay_for_that_and_used_at_once_where_it_is_on_disk(by_rule, monkeypatch):
+    x, p, quarter = np.array([0.1, 0.0]), np.ones(1), CALLS // 16  # four evaluations a step
+    model, known, backends = pendulum_with_loops(), [], []
+    for _ in range(6):
+        known.append(model.rk(0.0, x, 1e-3, quarter, p, RK4)[1])
+        backends.append(model.backend)
+    assert backends == ["casadi"] * 3 + ["c"] * 3 and len(by_rule) == 1
+    np.testing.assert_array_equal(known[0], known[1])
+    np.testing.assert_allclose(known[0], known[-1], rtol=1e-11, atol=1e-14)
+    new_process(monkeypatch)
+    other = pendulum_with_loops()
+    np.testing.assert_array_equal(other.rk(0.0, x, 1e-3, quarter, p, RK4)[1], known[-1])
+    assert other.backend == "c" and len(by_rule) == 1
+    announced = compiled(function(X2[1], -P1 * X2[0]), "announced", ("rk",))
+    announced.rk(0.0, x, 1e-3, CALLS // 4, p, RK4)
+    assert announced.backend == "c" and len(by_rule) == 2
+
+
+def test_evaluations_of_earlier_processes_count(by_rule, monkeypatch):
+    x, p, third = np.array([0.1, 0.0]), np.ones(1), CALLS // 12
+    backends = []
+    for _ in range(4):
+        model = pendulum_with_loops()
+        model.rk(0.0, x, 1e-3, third, p, RK4)
+        backends.append((model.backend, len(by_rule)))
+        compiler._tell()
         new_process(monkeypatch)
-        other.rk(0.0, x, 0.01, 1, p, RK4)
-        assert len(fresh) == 1 and other.backend == "c"
-    np.testing.assert_array_equal(few[0], few[1])
-    np.testing.assert_allclose(few[0], model.rk(0.0, x + 0.1, 0.01, 12, p, RK4)[1], rtol=1e-12)
+    assert backends == [("casadi", 0), ("casadi", 0), ("casadi", 0), ("c", 1)]
+    for told in compiler.cache_directory().glob("[0-9a-f]*[0-9a-f]"):
+        told.write_text("no number")
+    other = pendulum_with_loops()
+    other.rk(0.0, x, 1e-3, third, p, RK4)
+    assert other.backend == "c" and len(by_rule) == 1
+
+
+def test_steps_of_a_series_in_python_count_more_than_their_evaluations(by_rule):
+    sizes = {"nq": 1, "n": 1, "top": 2, "last": 2, "plain": 1}
+    model, steps = compiled(function(X2[1], -X2[0] / 2), "series", ("taylor",), sizes=sizes), 0
+    while model.backend == "casadi" and steps < CALLS:
+        steps += len(model.taylor(0.0, [0.1, 0.2], 1e3, [1.0], 1e-9, 1e-11, 100)) - 1
+    assert CALLS / 20 < steps < CALLS / 2 and len(by_rule) == 1
+
+
+def test_long_grids_are_compiled_when_they_pay_for_it(by_rule):
+    model, grids = pendulum(), 0
+    while model.backend == "casadi" and grids < 1000:
+        model.grid(0.0, np.zeros((2, 10_000)), [1.0])
+        grids += 1
+    assert 10 < grids < 1000 and 1 <= len(by_rule) <= 2  # of the unit of operations, too
+
+
+def test_one_motion_compiles_nothing_and_what_is_on_disk_serves_at_once(by_rule, monkeypatch):
+    scene = gallery["overhead-crane"]
+
+    def motion(**options):
+        model = sv.derive(*scene.build())
+        run = sv.simulate(model, model.start(guess=scene.guess), (0.0, 0.5), progress=False, **options)
+        return run.jets, model.function("path").backend
+
+    first, backend = motion()
+    assert not by_rule and backend == "casadi"
+    of_code, backend = motion(compiled=True)
+    assert by_rule and backend == "c"
+    np.testing.assert_array_equal(motion(compiled=True)[0], of_code)
+    interpreted, _ = motion(compiled=False)
+    np.testing.assert_allclose(interpreted, of_code, rtol=1e-9, atol=1e-11)
+    np.testing.assert_array_equal(interpreted, first)
+    compilations = len(by_rule)
+    new_process(monkeypatch)
+    again, backend = motion()
+    np.testing.assert_array_equal(again, of_code)
+    assert backend == "c" and len(by_rule) == compilations
+    with pytest.raises(SpecificationError, match=r"compiled='x' was given.* True, False or None.*Nearest: None.*Leave it out"):
+        motion(compiled="x")
 
 
 def test_a_call_has_the_same_bits_whatever_was_called_before(fresh, monkeypatch):
@@ -206,7 +282,7 @@ def test_no_compiler_by_choice_needs_no_warning(fresh, monkeypatch):
     monkeypatch.setenv("SERVOCTL_COMPILER", "none")
     model = pendulum(("rk",))
     model.rk(0.0, [0.1, 0.0], 0.1, 5, [1.0], RK4)
-    model.grid(0.0, np.zeros((2, GRID_POINTS + 1)), [1.0])
+    model.grid(0.0, np.zeros((2, MANY_POINTS + 1)), [1.0])
     assert compiler.library("int one;") is None
     assert model.backend == "casadi" and not fresh
 

@@ -18,7 +18,7 @@ TINY, LAST_SMALL = 1e-300, np.nextafter(1e5, 0)
 
 @pytest.fixture(autouse=True)
 def grids_compile(monkeypatch):
-    monkeypatch.setattr(functions, "GRID_POINTS", 0)
+    monkeypatch.setattr(functions, "MANY_POINTS", 0)
 
 
 def points(model, t, x, p):

@@ -1,8 +1,10 @@
 """Libraries from C text: compiled by the system's compiler, stored on disk by content, loaded.
 
-A library lies in the cache directory under the hash of its C text, the files that this may include, the flags, the
-compiler and the processor. The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a
-warning says where a named one does not exist.
+What is on disk is used at once; anything else is compiled when its evaluations, in this process and in earlier ones,
+have taken as long as compiling takes. A library lies in the cache directory under the hash of its C text, or of what
+this is written from, of the sources that write it and the files that it may include, the compiler and the processor.
+The compiler is ``SERVOCTL_COMPILER``, else ``CC``, else the first of cc, gcc and clang; a warning says where a named
+one is missing.
 ``SERVOCTL_COMPILER=none`` compiles nothing. Without a compiler, or where it fails, CasADi evaluates instead, and the
 process warns once, unless none was chosen.
 
@@ -23,12 +25,15 @@ import shlex
 import shutil
 import threading
 import warnings
+from collections import Counter
 from pathlib import Path
 
 from servoctl.codegen.cache import cache_directory, read_cached, replacing
 from servoctl.codegen.loops import SOURCES, digest
+from servoctl.errors import SpecificationError
 from servoctl.progress import stage
 
+CALLS = 10_000  # evaluations of a function by CasADi that take as long as compiling it
 PATIENCE_WITH_COMPILER = 120.0  # s: one that takes longer waits for something, such as a licence
 USUAL = ("cc", "gcc", "clang")  # compilers that are looked for
 FLAGS = ("-fPIC", "-shared", "-w", "-fno-math-errno")
@@ -39,7 +44,8 @@ _locks = {}  # key -> lock: no two threads compile the same text
 _guard = threading.Lock()
 _warned = False
 _hanging = set()  # commands that did not answer, and are not asked again
-_fewest = contextvars.ContextVar("fewest calls that are worth compiling", default=0)
+_calls = Counter()  # of what is not loaded, by key
+choice = contextvars.ContextVar("compiled, of `fixed`", default=None)
 
 
 class _CompilerFailed(Exception):
@@ -47,45 +53,65 @@ class _CompilerFailed(Exception):
 
 
 @contextlib.contextmanager
-def once(calls):
-    """While this holds, a library that is not on disk is compiled only if so many calls of its functions are known."""
-    token = _fewest.set(calls)
+def fixed(compiled):
+    """While this holds, libraries are compiled at their first use (True), or not used (False)."""
+    if compiled is not True and compiled is not False:
+        raise SpecificationError(
+            f"compiled={compiled!r} was given.",
+            "It is True, False or None.",
+            nearest="None, the default.",
+            do="Leave it out: what is on disk is used, and the rest compiled where that pays.",
+            compiled=compiled,
+        )
+    token = choice.set(compiled)
     try:
         yield
     finally:
-        _fewest.reset(token)
+        choice.reset(token)
 
 
-def worth_compiling(calls):
-    """Whether so many calls are."""
-    return calls >= _fewest.get()
+def library(text, level="-O1", exact=False, calls=math.inf, emitted=None):
+    """Load the library of a C translation unit, by which `calls` evaluations would be made now.
 
-
-def library(text, level="-O1", exact=False, calls=math.inf):
-    """Load the library of a C translation unit; compile it where it is neither loaded nor on disk.
-
-    None without a compiler or if compiling failed (one warning per process, unless none was chosen), or while it is not
-    on disk and fewer `calls` of its functions are known than `once` asks for. `level` may have further flags behind it,
-    which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is at
-    most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
+    Where it is not on disk it is compiled once the calls that this process and earlier ones have told make up for that,
+    and None until then; None, too, without a compiler or if compiling failed (one warning per process, unless none was
+    chosen). `emitted` returns C text and level where `text` only stands for them. `level` may have further flags behind
+    it, which a compiler may refuse, as clang does those of gcc; "-O1" compiles fastest, and its straight-line code is
+    at most a quarter slower than "-O3". With `exact`, results are those of the operations one by one, not contracted.
     """
     command, identity = _compiler()
-    if command is None:
-        chosen = os.environ.get("SERVOCTL_COMPILER") == "none" or not worth_compiling(calls)
-        return None if chosen else _without("No C compiler was found")
-    level, *tuning = level.split()
-    flags = (level, *FLAGS, *(ROUNDED if exact else ())), (*_optional_flags(), *tuning)
-    parts = (text, digest(), *flags[0], *flags[1], identity, platform.machine(), _processor())
-    key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    if choice.get() is False or os.environ.get("SERVOCTL_COMPILER") == "none":
+        return None
+    key = hashlib.sha256("\0".join((text, level, str(exact), digest(), _machine(identity))).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            found = _open(cache_directory() / f"{key}.so")
-            if found is None and not worth_compiling(calls):
+            first = key not in _calls
+            _calls[key] += calls + (_told(key) if first else 0)
+            due = choice.get() or _calls[key] >= CALLS
+            found = _open(cache_directory() / f"{key}.so") if command and (first or due) else None
+            if found is None and not due:
                 return None
-            _loaded[key] = found or _build(text, flags, f"{key}.so", command)
+            if command is None:
+                return _without("No C compiler was found")
+            _loaded[key] = found or _build(*(emitted() if emitted else (text, level)), exact, f"{key}.so", command)
         return _loaded[key]
+
+
+def _told(key):
+    """The calls by which earlier processes would have used a library."""
+    with contextlib.suppress(OSError, ValueError):
+        return float(read_cached(cache_directory() / key))
+    return 0.0
+
+
+@atexit.register
+def _tell():
+    """Leave the calls of what was not compiled to the next process, for which it may pay."""
+    for key in _calls.keys() - _loaded.keys():
+        with contextlib.suppress(OSError), replacing(cache_directory() / key) as temporary:
+            Path(temporary).write_text(repr(_calls[key]), encoding="utf-8")
 
 
 def compiler():
@@ -106,7 +132,9 @@ def compiler_in_words():
 
 
 def _compiler():
-    """Command of the compiler (a tuple) and its identity (str); (None, None) without a compiler."""
+    """Command of the compiler (a tuple) and its identity (str); (None, None) where there is none to use."""
+    if choice.get() is False:
+        return None, None
     return _identified(*(os.environ.get(name) for name in ("SERVOCTL_COMPILER", "CC", "PATH")))
 
 
@@ -128,6 +156,12 @@ def _identified(chosen, cc, path):
             what = f"{variable}={candidate!r} names no program: the next of CC, {', '.join(USUAL)} is taken."
             warnings.warn(what, RuntimeWarning, stacklevel=2)
     return None, None
+
+
+@functools.cache
+def _machine(identity):
+    """What libraries depend on beside their sources: the identity of the compiler, and the processor."""
+    return repr((identity, platform.machine(), _processor()))
 
 
 @functools.cache
@@ -176,15 +210,14 @@ def _scratch():
 
 
 @stage("compiling")
-def _build(text, flags, file_name, command):
-    """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full.
-
-    `flags` are those that it takes, and those that it may refuse.
-    """
+def _build(text, level, exact, file_name, command):
+    """Compile into the cache, or into a temporary directory if that fails, as where the cache's disk is full."""
     import subprocess
 
     if command in _hanging:
         return None
+    level, *tuning = level.split()
+    flags = (level, *FLAGS, *(ROUNDED if exact else ())), (*_optional_flags(), *tuning)
     for directory in (cache_directory, _scratch):
         try:
             return _compile(text, flags, directory() / file_name, command)
@@ -198,6 +231,7 @@ def _build(text, flags, file_name, command):
 
 
 def _compile(text, flags, target, command):
+    """Compile with flags that the compiler takes, and those that it may refuse."""
     import subprocess
 
     flags, optional = flags

@@ -1,27 +1,29 @@
 """A function of (t, x, p) on NumPy arrays: single points, grids, Runge-Kutta, Taylor, and Newton along a path.
 
-Compiled code and CasADi agree to rounding only. Which of the two evaluates depends on the call alone, never on earlier
-calls or on the cache, so that a repeated call has the same bits: loops, buffers and long grids are compiled at their
-first use, single points and short grids are left to CasADi, as is everything where there is no compiler. Single points
-of a function that is called often are compiled too, with CasADi's operations one by one, so that their bits stay.
+Loops, buffers and long grids take compiled code if it is on disk; else CasADi evaluates until their evaluations have
+taken as long as compiling takes (`compiler.library`). The two agree to rounding only: a repeated call has the same bits
+where `compiler.fixed` says which of them is used. Then it depends on the call alone. Single points and short grids are
+left to CasADi, as is everything where there is no compiler; single points of a function that is called often are
+compiled too, with CasADi's operations one by one, so that their bits stay.
 """
 
 import functools
+import hashlib
 import itertools
 import math
-import os
 
 import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
-from servoctl.codegen.interpreted import BLOCK, Interpreter, restored, restored_grid, weighted
+from servoctl.codegen.compiler import CALLS
+from servoctl.codegen.interpreted import BLOCK, MANY_POINTS, Interpreter, restored, restored_grid, weighted
 from servoctl.codegen.native import Library, builtin
+from servoctl.codegen.paths import none_chosen
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import contains
 
-GRID_POINTS = 2_500  # 20 longer grids take CasADi as long as writing and loading a library, 200 as compiling it
-CALLS = 10_000  # of one point: CasADi has taken as long as compiling takes then, where the function is long
+STEP = 6  # evaluations that take as long as what surrounds that of a Taylor step in Python
 FULLY_OPTIMISED = 6_000  # statements of C: up to here -O3 takes at most 1.5 s; more are as fast with -O1
 ALONG_A_PATH = "-O2 -fno-tree-pre -fno-tree-vrp -fno-gcse -fno-tree-slp-vectorize"  # Newton: 3/4 of the time of -O3
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
@@ -77,18 +79,15 @@ class Compiled:
         self.expression, self._symbol = f, f"servoctl_{name}"
         self._x_shape, self._p_shape = (self.n_x,), (self.n_p,)
         self._interpreter = Interpreter(f, project, self.sizes, self.others.get("settled"))
-        self._text, self._builtin, self._calls, self._in_loops = None, None, 0, 0
+        self._builtin, self._calls, self._in_loops = None, 0, {"_library": 1, "_lanes": 1}  # since the last look for it
 
     def __reduce__(self):
         parts = (self.expression, self.name, self.loops, self._project, self.others, self.sizes)
-        # Emitting takes longer than reading: the C text travels until the library is loaded, where it can be compiled.
-        travels = self.loops and "_library" not in vars(self) and not self.too_long and compiler.compiler() is not None
-        text = self.source() if travels else ""
-        state = {"_text": text or None}
-        return Compiled, parts, state | ({"operations": self.operations} if self.loops else {})
+        known = {"operations": self.operations, "identity": self.identity} if self.loops else {}
+        return Compiled, parts, known
 
     def __eq__(self, other):
-        return self is other or (isinstance(other, Compiled) and self.source() == other.source())
+        return self is other or (isinstance(other, Compiled) and self.identity == other.identity)
 
     def __hash__(self):
         return hash((self.name, self.n_x, self.n_p, self.n_y))
@@ -101,6 +100,13 @@ class Compiled:
     def operations(self):
         """Number of arithmetic operations of one evaluation."""
         return emit.operations(self.expression)
+
+    @functools.cached_property
+    def identity(self):
+        """Hash of what determines the C text, which takes longer to write."""
+        functions = {"": self.expression, "project": self._project, **self.others}
+        parts = ((name, f.serialize()) for name, f in functions.items() if f is not None)
+        return hashlib.sha256(repr((self.name, self.loops, self.sizes, *parts)).encode()).hexdigest()
 
     @property
     def interpreted(self):
@@ -136,7 +142,7 @@ class Compiled:
         For loops in Python over single evaluations. They belong to the calling thread; its other evaluations overwrite
         them.
         """
-        self._in_loops = math.inf
+        self._in_loops["_library"] = math.inf
         return self._library.workspace.buffer
 
     def grid(self, t, x, p):
@@ -149,8 +155,8 @@ class Compiled:
         t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
         p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
         y = np.empty((self.n_y, n))
-        self._in_loops += n // BLOCK
-        (self._lanes if n > GRID_POINTS else self._library if self.loops else self._interpreter).grid(t, x, p, y)
+        self._in_loops["_lanes" if n > MANY_POINTS else "_library"] += n / BLOCK
+        (self._lanes if n > MANY_POINTS else self._library if self.loops else self._interpreter).grid(t, x, p, y)
         return y
 
     def rk(self, t0, x0, h, n_steps, p, tableau, every=1, project_every=0):
@@ -176,7 +182,7 @@ class Compiled:
         log = np.append(np.arange(0, n_steps, every), n_steps)
         states, outputs = np.empty((self.n_x, log.size)), np.empty((self.n_y - self.n_x, log.size))
         counts = (int(n_steps), int(every), int(project_every) if self._project is not None else 0)
-        self._in_loops += n_steps * len(tableau[1])
+        self._in_loops["_library"] += n_steps * len(tableau[1])
         n = 1 + self._library.rk(float(t0), x0, float(h), counts, p, tableau, states, outputs)
         return t0 + log[:n] * h, states[:, :n], outputs[:, :n]
 
@@ -196,7 +202,7 @@ class Compiled:
         x0, p = self._array("x0", x0, self._x_shape), self._array("p", p, self._p_shape)
         nodes = np.empty((most, 1 + self.n_x + self.n_y))
         n, iterations = self._library.continuation(cuts, x0, p, float(longest), nodes)
-        self._in_loops += iterations
+        self._in_loops["_library"] += iterations
         return nodes[:n], iterations
 
     def newton(self, t, nodes, p):
@@ -212,8 +218,8 @@ class Compiled:
         t, p = self._array("t", t, (np.size(t),)), self._array("p", p, self._p_shape)
         nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
         z = np.empty((self.n_y - self.sizes.get("pivots", 0), t.size))
-        self._in_loops += t.size
         n, iterations = self._library.newton(t, nodes, p, z)
+        self._in_loops["_library"] += iterations if n < BLOCK else iterations / BLOCK + n % BLOCK
         return z[:, :n], iterations
 
     def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
@@ -232,7 +238,7 @@ class Compiled:
         self._place(library, t0, x0, p)
         atol, weights = (atol, None) if isinstance(atol, float) else weighted(atol)
         rows = library.taylor(ends, rtol, atol, every, max_steps, weights)
-        self._in_loops += len(rows)
+        self._in_loops["_library"] += STEP * len(rows)
         return rows
 
     def whole(self, start, p, tolerances, most, times, net):
@@ -292,9 +298,9 @@ class Compiled:
         """A C function of the library, which is compiled if necessary; None without a compiler.
 
         Its name follows ``servoctl_NAME_``: "point", "grid", a key of `others`, or a function of a loop's file. `calls`
-        are evaluations for which it is needed, of which `compiler.once` may ask for more: then None, too.
+        are evaluations for which it is needed: None, too, while these do not make up for compiling it.
         """
-        self._in_loops += calls
+        self._in_loops["_library"] += calls
         return self._library.native(suffix)
 
     def _require_loop(self, loop):
@@ -316,45 +322,38 @@ class Compiled:
     @property
     def _library(self):
         """Evaluator of loops and buffers: compiled code, or CasADi where nothing is compiled."""
-        if (found := vars(self).get("_library")) is not None:
-            return found
-        return self._interpreter if self.too_long else self._loaded("_library", self.source, lambda: self._level)
+        return self._interpreter if self.too_long else self._loaded("_library")
 
     @property
     def _lanes(self):
         """Evaluator of long grids: a separate library, because twice the code takes twice the time to compile."""
-        if "newton" in self.loops:
-            return self._library
-        return self._loaded("_lanes", lambda: emit.emit(self.expression, self._symbol), lambda: "-O1")
+        return self._library if "newton" in self.loops else self._loaded("_lanes")
 
-    def _loaded(self, name, source, level):
-        """Evaluator by the library of a C text, which takes long to write and is not written without a compiler."""
-        if name not in vars(self):
-            if os.environ.get("SERVOCTL_COMPILER") == "none":
-                return self._interpreter
-            text = (source(), level()) if compiler.compiler() else ("",)
-            library = compiler.library(*text, calls=self._in_loops)
-            if library is None and not compiler.worth_compiling(self._in_loops):
-                return self._interpreter
-            self._text, found = None, self._interpreter
-            if library is not None:
-                found = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
-            vars(self)[name] = found
-        return vars(self)[name]
+    def _loaded(self, name):
+        """Evaluator by a library; another one, or CasADi, as long as its calls do not make up for compiling it."""
+        found = vars(self).get(name)
+        if compiler.choice.get() is False:
+            return self._interpreter
+        if found is None and (calls := self._in_loops[name]) and not none_chosen():
+            self._in_loops[name] = 0
+            identity, emitted = f"{name} {FULLY_OPTIMISED} {self.identity}", functools.partial(self._emitted, name)
+            if (library := compiler.library(identity, calls=calls, emitted=emitted)) is not None:
+                found = vars(self)[name] = Library(library, self._symbol, self.n_x, self.n_p, self.n_y)
+        return found or vars(self).get("_library", self._interpreter)
 
-    @property
-    def _level(self):
-        if {*self.loops} <= {"rk", "radau"} or self.source().count(";") > FULLY_OPTIMISED:
-            return "-O1"
-        return ALONG_A_PATH if self.loops == ("newton",) else "-O3"  # as fast there, with the same bits
+    def _emitted(self, name):
+        """C text of a library, and how it is compiled."""
+        if name == "_lanes":
+            return emit.emit(self.expression, self._symbol), "-O1"
+        text = self.source()
+        if {*self.loops} <= {"rk", "radau"} or text.count(";") > FULLY_OPTIMISED:
+            return text, "-O1"
+        return text, ALONG_A_PATH if self.loops == ("newton",) else "-O3"  # as fast there, with the same bits
 
     def source(self):
-        """C text of the library."""
-        text = self._text
-        if text is None:
-            wide, parts = "newton" in self.loops, {"project": self._project, "others": self.others, "sizes": self.sizes}
-            text = self._text = emit.emit(self.expression, self._symbol, self.loops, **parts, wide=wide)
-        return text
+        """C text of the library with the loops."""
+        wide, parts = "newton" in self.loops, {"project": self._project, "others": self.others, "sizes": self.sizes}
+        return emit.emit(self.expression, self._symbol, self.loops, **parts, wide=wide)
 
     def _place(self, evaluator, t, x, p):
         """Write t, x and p into an evaluator's workspace of this thread; return its y and its call."""

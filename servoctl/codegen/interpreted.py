@@ -22,10 +22,10 @@ from servoctl.codegen.loops import (
     STEADY,
 )
 from servoctl.codegen.machine import ENOUGH, machine
-from servoctl.codegen.paths import evaluated, jets_at, jets_in, with_jets
+from servoctl.codegen.paths import evaluated, jets_at, jets_in, none_chosen, with_jets
 
 BLOCK = 128  # instants of a path that are solved together
-MANY_POINTS = 2_000  # of them CasADi takes longer, one by one, than writing the list of operations takes
+MANY_POINTS = 2_000  # one by one, of which CasADi takes longer than writing a list of operations or loading a library
 
 _guard = threading.Lock()
 
@@ -105,7 +105,7 @@ class Interpreter:
 
     def __init__(self, f, project=None, sizes=None, settled=None):
         self._f, self._n_x, self._project, self._sizes, self._settled = f, f.numel_in(1), project, sizes, settled
-        self._parts, self._points = (1, self._n_x, f.numel_in(2), f.numel_out(0)), 0
+        self._parts, self._points, self._machine = (1, self._n_x, f.numel_in(2), f.numel_out(0)), 0, None
         self.workspace = Workspace(*self._parts[1:], self._connect)
 
     def _connect(self, row, parts):
@@ -138,7 +138,7 @@ class Interpreter:
     def grid(self, t, x, p, y):
         """Fill y (n_y, N) with the outputs at t (N,) and the columns of x, and of p if that is a matrix."""
         self._points += t.size
-        if self._points >= MANY_POINTS and t.size >= ENOUGH and self._machine is not None:
+        if self._points >= MANY_POINTS and t.size >= ENOUGH and self._by_machine(t.size):
             self._machine.grid(t, x, with_jets(self._f, t, p), y)
             return
         left = t.size % BLOCK
@@ -167,10 +167,11 @@ class Interpreter:
     def _blocks(self):
         return Blocks(self._block, self._parts, self._connected)
 
-    @functools.cached_property
-    def _machine(self):
-        """Evaluation of many points in C; None where it cannot."""
-        return machine(self._f, self._points // BLOCK)
+    def _by_machine(self, points):
+        """Whether so many points are evaluated in C."""
+        if self._machine is None and not none_chosen():
+            self._machine = machine(self._f, points)
+        return self._machine
 
     @functools.cached_property
     def _block(self):
@@ -287,13 +288,20 @@ class Interpreter:
             h, (begin, end) = min(h, longest), next(pieces, (None, None)) if t == end else (begin, end)
         return k, path.count
 
+    def _blockwise(self, parts, points):
+        """The call of the function on arrays (BLOCK, n) of t, x, p and y, and what must live as long as it."""
+        if not self._by_machine(points):
+            return self._connected(self._block, parts)
+        t, x, p, y = (part.T for part in parts)
+        return lambda: self._machine.grid(t, x, with_jets(self._f, t, p[:, 0]), y), None
+
     @np.errstate(all="ignore")
     def newton(self, t, nodes, p, z):
         """Fill columns of z; return the numbers of points solved and of evaluations. See `Compiled.newton`."""
         path, k, alone = self._path(p), 0, 0
         (_, n_x, _, n_y), rows = self._parts, len(z)
         parts = np.zeros(BLOCK), np.zeros((BLOCK, n_x)), np.tile(p, (BLOCK, 1)), np.zeros((BLOCK, n_y))
-        call = self._connected(self._block, parts) if t.size >= BLOCK else None
+        call = self._blockwise(parts, t.size) if t.size >= BLOCK else None
         forward = nodes[-1, 0] >= nodes[0, 0]
         ends = nodes[1:, 0] if forward else -nodes[1:, 0]
         first = np.minimum(np.searchsorted(ends, t if forward else -t), max(len(nodes) - 2, 0))

@@ -46,6 +46,6 @@ def source(name):
 
 @functools.cache
 def digest():
-    """Hash of all C files: units include them by name, so that it belongs to the key of every library."""
-    files = sorted((file.name, file.read_bytes()) for file in SOURCES.iterdir() if file.name.endswith((".c", ".h")))
+    """Hash of all C files, which units include by name, and of what writes units: a part of each library's key."""
+    files = sorted((f.name, f.read_bytes()) for f in (*SOURCES.glob("*.[ch]"), *Path(__file__).parent.glob("*.py")))
     return hashlib.sha256(repr(files).encode()).hexdigest()

@@ -11,20 +11,22 @@ import casadi as ca
 import numpy as np
 
 from servoctl.codegen import compiler, emit
+from servoctl.codegen.compiler import CALLS
 
 TOGETHER = 64  # points of a block: the values of sixty operations stay in the first cache
 ENOUGH = 4  # points that are worth a block: CasADi evaluates fewer of them one by one in less time
 
 
-def machine(f, calls):
-    """The `Machine` of an SX function (t, x, p) -> y; None without a compiler, or where an operation is no arithmetic.
+def machine(f, points):
+    """The `Machine` of an SX function (t, x, p) -> y; False where not all is arithmetic, None while it is not compiled.
 
-    CasADi has its own approximation of the inverse error function.
+    CasADi has its own approximation of the inverse error function. It would be used at so many points now.
     """
-    used = {f.instruction_id(k) for k in range(f.n_instructions())}
-    if not used <= emit.SAME_BITS or (library := _operations(calls)) is None:
+    calls = points * f.n_instructions() / CALLS  # it is compiled for all functions, as long as one of so many
+    if (library := compiler.library(_written(TOGETHER), "-O3", True, calls)) is None:
         return None
-    return Machine(f, library.servoctl_machine)
+    used = {f.instruction_id(k) for k in range(f.n_instructions())}
+    return used <= emit.SAME_BITS and Machine(f, library.servoctl_machine)
 
 
 class Machine:
@@ -59,8 +61,3 @@ class Machine:
 
 
 _written = functools.cache(emit.emit_machine)
-
-
-def _operations(calls):
-    """The library of the unit; None without a compiler."""
-    return compiler.library(_written(TOGETHER), "-O3", True, calls) if compiler.compiler() else None

@@ -9,7 +9,6 @@ NumPy where there is no compiler. Both have the same bits.
 import ctypes
 import os
 import weakref
-from functools import cache, cached_property
 
 import casadi as ca
 import numpy as np
@@ -29,6 +28,8 @@ class Followed:
 
     `address` is a number of p for as long as this object lives; `jets` has the derivatives at some instants.
     """
+
+    library = None  # of paths.c, the same for all paths; None while it is not compiled
 
     def __init__(self, paths):
         self.paths = tuple(paths)  # of one component each
@@ -59,7 +60,9 @@ class Followed:
 
     def _evaluated(self, t, order, instants):
         """As `jets`."""
-        if self._library is None:
+        if Followed.library is None and not none_chosen():
+            Followed.library = compiler.library(IN_C, "-O2", exact=True, calls=(order + 1) * len(self.paths))
+        if Followed.library is None or none_chosen():
             jets, known = np.full((order + 1, len(self.paths), len(t)), np.nan), np.isfinite(t) & np.isfinite(instants)
             for i, path in enumerate(self.paths):
                 jets[:, i, known] = path.jets(t[known], order, instants[known])[:, 0]
@@ -67,20 +70,15 @@ class Followed:
         jets = np.zeros((len(t), (order + 1) * len(self.paths)))
         arrays = *(np.ascontiguousarray(part, dtype=float) for part in (instants, t)), jets
         sizes = map(ctypes.c_int64, (len(self.paths), order, len(t)))
-        self._library.servoctl_paths(
+        Followed.library.servoctl_paths(
             ctypes.c_double(self.address), *sizes, *(ctypes.c_void_p(a.ctypes.data) for a in arrays)
         )
         return jets.T
 
-    @cached_property
-    def _library(self):
-        return None if os.environ.get("SERVOCTL_COMPILER") == "none" else _of_paths(compiler.compiler())
 
-
-@cache
-def _of_paths(command):
-    """The library of paths.c by the compiler that a command calls; None without one."""
-    return compiler.library(IN_C, "-O2", exact=True, calls=0) if command else None
+def none_chosen():
+    """Whether the process compiles nothing, by choice."""
+    return os.environ.get("SERVOCTL_COMPILER") == "none"
 
 
 def followed(address):
@@ -106,7 +104,7 @@ def jets_at(f, t, p):
     if p.shape[1] == 1:
         return followed(p[0, 0]).jets(t, order, instants)
     jets = np.empty((jets_in(f), len(t)))
-    for address in np.unique(p[0]):
+    for address in {*p[0].tolist()}:
         some = p[0] == address
         jets[:, some] = followed(address).jets(t[some], order, instants[some])
     return jets

@@ -99,7 +99,7 @@ def run_loop(plant, law, loop, advance=None, rates="ode"):
     """
     n, n_y, n_z = loop.samples + 1, len(loop.measured), len(loop.z0)
     ode, p = plant.function(rates), np.append(plant.place, loop.p)
-    native = ode.native("closed", 4 * loop.samples * loop.substeps) if advance is None else None
+    native = ode.native("closed", loop.samples * loop.substeps) if advance is None else None
     exact = native is not None and not n_z and loop.noise is None and loop.quantum is None  # the law gets states
     logs = {
         "x": np.empty((n, ode.n_x)),

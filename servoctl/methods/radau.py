@@ -229,10 +229,10 @@ class RadauSteps(BulkSteps):
     def _begin(self, a, x, b):
         if self.f.native("radau") is None:  # compiled here, as the start may choose other pivots
             raise SpecificationError(
-                "method='RadauIIA' was given, and there is no C compiler.",
+                "method='RadauIIA' was given, and there is no C compiler, or compiled=False.",
                 "The loop over its steps is C code.",
                 nearest="method='Radau', scipy's of order 5.",
-                do="Use it, or install a C compiler (gcc or clang).",
+                do="Use it, leave out compiled=False, or install a C compiler (gcc or clang).",
                 method="RadauIIA",
             )
         if self.step is None:

@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 import servoctl as sv
-from servoctl.codegen.compiler import once
-from servoctl.codegen.function import CALLS
 from servoctl.errors import IntegrationStopped, ServoError, SingularProgram
 from servoctl.figures.animation import shows_mechanism
 from servoctl.figures.sheet import draw_sheet
@@ -55,7 +53,7 @@ def add_run(run):
 
 def _run(args):
     name, scene = find_scene(args.scene)
-    with folder_of(args, name) as folder, once(CALLS):
+    with folder_of(args, name) as folder:
         return _compute(args, name, scene, folder)
 
 

@@ -6,6 +6,7 @@ import signal
 import threading
 from concurrent.futures import as_completed
 
+from servoctl.codegen.compiler import fixed
 from servoctl.errors import ServoError
 
 
@@ -33,7 +34,8 @@ def _in_turn(function, calls):
     """(key, result, None) of the calls, in this process."""
     with _recorded_interrupts() as interrupts:
         for key, arguments in calls.items():
-            result = function(*arguments)
+            with fixed(True):  # the same bits in any order and on any worker
+                result = function(*arguments)
             if interrupts:
                 raise KeyboardInterrupt  # which `simulate` inside the function caught: it is the result of half a run
             yield key, result, None
@@ -66,7 +68,8 @@ def _in_worker(function, arguments):
     """The result of a call; a process leaves Ctrl-C to its parent, and finishes what it is at."""
     if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return function(*arguments)
+    with fixed(True):
+        return function(*arguments)
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ from itertools import groupby
 import numpy as np
 
 from servoctl.checks import as_span, mapping, named, positive, positives, require_kind, text
+from servoctl.codegen.compiler import fixed
 from servoctl.errors import LimitExceeded, ServoError, SpecificationError
 from servoctl.markup import Shown
 from servoctl.methods.choice import (
@@ -438,7 +439,8 @@ def _errors_and_cost(comparison, motion, method, treatment, value, limit):
 
     def at(times):
         options = {"drift": treatment, "t_eval": times, "progress": Deadline(limit, motion.span)}
-        return whole_run(simulated(motion.model, motion.start, motion.span, method, **options))
+        with fixed(True):
+            return whole_run(simulated(motion.model, motion.start, motion.span, method, **options))
 
     runs, timed = [at(comparison.times)], []
     while len(timed) < TIMED and sum(timed) <= ENOUGH * limit:
