@@ -177,11 +177,12 @@ class Rank:
         Rows TᵀM of (3.18) hold quotients of pivots. An orthonormal basis of their span does not, and where a pivot is
         zero its limit is that of a state so near that none could tell them apart.
         """
-        aside = self.tolerance.states(x) * np.cos(np.arange(len(x)))[:, None]
-        stacked = zip(self._stacked(t, x), self._stacked(t, x + aside), self.columns, rows, strict=True)
-        result = np.ones((2, x.shape[1]))
-        for i, (m, beside, c, r) in enumerate(stacked):
-            m = np.where(np.isfinite(m).all(axis=(1, 2), keepdims=True), m, beside)
+        result, stacked = np.ones((2, x.shape[1])), self._stacked(t, x)
+        if not all(np.isfinite(m).all() for m in stacked):
+            aside = self._stacked(t, x + self.tolerance.states(x) * np.cos(np.arange(len(x)))[:, None])
+            pairs = zip(stacked, aside, strict=True)
+            stacked = [np.where(np.isfinite(m).all(axis=(1, 2), keepdims=True), m, beside) for m, beside in pairs]
+        for i, (m, c, r) in enumerate(zip(stacked, self.columns, rows, strict=True)):
             known, some = np.isfinite(m).all(axis=(1, 2)), [] if i else [*self.balances]
             scaled = m[known] / c / np.where(r > 0, r, 1.0)[:, None]
             if some:
@@ -304,18 +305,16 @@ class Rank:
     def _singular(self, stretch, k, before):
         """The outcome of step k if the rank is lost in it: where a least value is zero, or from its start on."""
         along = _Along(self, stretch, k, stretch if k else before)
-        places, signs = along.least(), [self.sign(*end) for end in along.ends]
-        zeros = [t for i, t, allowed in places if not along.value(t)[i] > allowed + self._doubt(t, along)[i]]
-        if not zeros and signs[0] * signs[1] < 0:
-            zeros = [min((t for _, t, _ in places), key=lambda t: along.value(t).min(), default=along.span[1])]
-        if not zeros:
-            stays = (along.sizes <= self._doubt(along.span[1], along)[:, None]).all(axis=1)
-            zeros = [along.zero(i) for i in np.flatnonzero(stays)]
-        if not zeros:
-            return None
-        inside = (zeros[0] - along.span[0]) * (zeros[0] - along.span[1]) < 0
-        t = zeros[0] if inside else along.span[0]
-        return Singular(k, t, along.state(t), zeros[0], VANISHES)
+        places = [(along.value(t)[i], t, i, allowed) for i, t, allowed in along.least()]
+        value, t, i, allowed = min(places, default=(np.inf, along.span[1], 0, 0.0))
+        doubt, signs = self._doubt(t, along), [self.sign(*end) for end in along.ends]
+        if not value <= allowed + doubt[i] and not signs[0] * signs[1] < 0:
+            stays = np.flatnonzero((along.sizes <= doubt[:, None]).all(axis=1))
+            if not len(stays):
+                return None
+            t = along.zero(stays[0])
+        end = t if (t - along.span[0]) * (t - along.span[1]) < 0 else along.span[0]
+        return Singular(k, end, along.state(end), t, VANISHES)
 
     def _doubt(self, t, along):
         """By how much the least singular values at an instant may be wrong as the state is, (2,).
@@ -351,7 +350,12 @@ class _Along:
         self.ends = [(t, self.state(t)) for t in self.span]
         sizes = zip(*(rank.norms(*place) for place in self.ends), strict=True)
         self.rows = [np.fmax(*np.nan_to_num(pair, posinf=0.0)) for pair in sizes]
-        states = np.column_stack([self.state(t) for t in self.t])
+        inside = (self.t - start) * (end - start) > 0
+        states = np.column_stack([self.ends[0][1]] * len(self.t))
+        states[:, inside] = stretch.dense(np.full(inside.sum(), k), self.t[inside])
+        states[:, -1] = self.ends[1][1]
+        if known:
+            states[:, 0] = self.state(self.t[0])
         self.sizes = rank.along(self.t, states, self.rows)
 
     def state(self, t):

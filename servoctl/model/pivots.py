@@ -19,6 +19,8 @@ def pivot_sizes(model):
 def pivot_strength(model, t, jets):
     """The smallest chosen pivot at an instant, relative to its size where pivots were chosen; 0 if one has no value."""
     count = len(row_pivots(model)) if model.reduction.orthogonal else None
+    if count == 0:
+        return 1.0
     pivots, sizes = np.abs(pivots_at(model, t, jets, count)), pivot_sizes(model)[:count]
     relative = pivots / np.where(sizes > 0, sizes, 1.0)
     return float(np.nan_to_num(relative, nan=0.0, posinf=0.0).min(initial=1.0))
