@@ -464,7 +464,8 @@ class Stepping:
             if tried < MOST_CHANGES and self._repivot(outcome.t, outcome.x):
                 return True
         stop = self.edges and self.edges.stopped(self.model, outcome.t)
-        self.motion.end_after(outcome.t, stop or singular(self.rank, at, outcome.x, why))
+        last = min(outcome.t, at, key=lambda t: abs(t - self.rank.start[0]))
+        self.motion.end_after(last, stop or singular(self.rank, at, outcome.x, why))
         return False
 
     def _fail(self, t, x, why):

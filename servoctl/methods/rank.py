@@ -19,6 +19,7 @@ DEGRADED = 0.02  # of its reference: a pivot below this is weak
 HELPS = 5.0  # times a weak pivot: the rank measure of a matrix for which other pivots are better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero, and one of which the reference is this is infinite
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
+AGAIN = 0.5  # of a weak pivot where the rank was followed: below this it is followed again
 LOST = 0.1  # of its best: below this, rank is why no step succeeds
 ERRS = 10.0  # times its tolerance, and the way to its invariants, by which a state may be wrong
 NEXT = 1e-3  # of a step: the distance from its start of an instant inside, where no step lies before
@@ -115,6 +116,7 @@ class Rank:
         """Start a piece at t [s] with pivots (n_g,) of a model; the first step is compared with them."""
         self.model, self.reference, self.before = model, np.abs(pivots), None
         self.recent = np.array([t]), pivots[:, None]  # the last two instants, and pivots there
+        self.followed = np.full(len(pivots), np.inf)  # sizes of weak pivots where the rank was last followed
 
     def go_on(self, model, pivots, t, x):
         """Go on from a state with a model of the same rows."""
@@ -241,36 +243,35 @@ class Rank:
         pole = self._pole(stretch)
         if pole is not None:
             return pole
-        doubtful, changed, least = self._doubtful(stretch)
-        for k in map(int, np.flatnonzero(doubtful)):
-            found = self._singular(stretch, k, before) or self._weak(stretch, k, changed[:, k], least[:, k])
+        sudden, changed, least = self._pivots_in(stretch)
+        for k in map(int, np.flatnonzero(sudden | (least < DEGRADED).any(axis=0))):
+            falls = least[:, k] < AGAIN * self.followed
+            found = self._singular(stretch, k, before) if sudden[k] or falls.any() else None
+            found = found or self._weak(stretch, k, changed[:, k], least[:, k])
             if found is not None:
                 return found
+            self.followed = np.where(falls, least[:, k], self.followed)
+        self.followed[least[:, -1] >= DEGRADED] = np.inf
         return Fine(count)
 
-    def _doubtful(self, stretch):
-        """Which steps are doubtful (S,); whether pivots change their signs in them, and their least sizes, (n_g, S).
+    def _pivots_in(self, stretch):
+        """In which steps a pivot may have been zero (S,): it changes its sign (n_g, S), or turns; least sizes (n_g, S).
 
-        Sizes are relative to the largest so far; what is not finite has none. A pivot without a sign, as there is no
-        choice of pivots, may have been zero beside a least one.
+        Sizes are relative to the largest so far; what is not finite has none.
         """
         (before, known), (n_g, count, m) = self.recent, stretch.pivots.shape
         t = np.append(before, stretch.t[:-1, None] + np.diff(stretch.t)[:, None] * stretch.parts)
         track = np.nan_to_num(np.column_stack([known, stretch.pivots.reshape(n_g, -1)]), posinf=0.0, neginf=0.0)
-        sizes = np.abs(track)
+        sizes, signs, first = np.abs(track), np.sign(track), len(before)
         largest = np.maximum(np.maximum.accumulate(sizes, axis=1), self.reference[:, None])
-        relative, turned = sizes / np.where(largest > 0, largest, 1.0), np.zeros(len(t), dtype=bool)
-        if self.model.reduction.orthogonal:
-            beside = may_vanish(t, sizes).any(axis=0)
-            turned[1:-1] |= beside
-            turned[2:] |= beside
+        turned, beside = np.zeros(len(t), dtype=bool), may_vanish(t, sizes).any(axis=0)
+        turned[1:-1] |= beside  # the zero lies before or after the least of three
+        turned[2:] |= beside
         self.recent, self.reference = (t[-2:], track[:, -2:]), largest[:, -1]
-        first, signs = len(before), np.sign(track)
         changed = (signs[:, :-1] * signs[:, 1:] < 0)[:, first - 1 :].reshape(n_g, count, m).any(axis=2)
-        inner = relative[:, first:].reshape(n_g, count, m)
-        least = np.minimum(inner.min(axis=2), relative[:, first - 1 : -1 : m])
-        weak = (changed | (least < DEGRADED)).any(axis=0)
-        return weak | turned[first:].reshape(count, m).any(axis=1), changed, least
+        ends = np.maximum(largest[:, first + m - 1 :: m], np.finfo(float).tiny)
+        least = np.fmin(sizes[:, first:].reshape(n_g, count, m).min(axis=2), sizes[:, first - 1 : -1 : m]) / ends
+        return changed.any(axis=0) | turned[first:].reshape(count, m).any(axis=1), changed, least
 
     def _pole(self, stretch):
         """Singular where a pivot grows without bound in one step, as that of a row divided by a speed that vanishes."""
@@ -308,13 +309,22 @@ class Rank:
         places = [(along.value(t)[i], t, i, allowed) for i, t, allowed in along.least()]
         value, t, i, allowed = min(places, default=(np.inf, along.span[1], 0, 0.0))
         doubt, signs = self._doubt(t, along), [self.sign(*end) for end in along.ends]
-        if not value <= allowed + doubt[i] and not signs[0] * signs[1] < 0:
+        if signs[0] * signs[1] < 0:
+            t = self._change_of_sign(along, signs[0])
+        elif not value <= allowed + doubt[i]:
             stays = np.flatnonzero((along.sizes <= doubt[:, None]).all(axis=1))
             if not len(stays):
                 return None
             t = along.zero(stays[0])
         end = t if (t - along.span[0]) * (t - along.span[1]) < 0 else along.span[0]
         return Singular(k, end, along.state(end), t, VANISHES)
+
+    def _change_of_sign(self, along, sign):
+        """The instant at which the determinant changes the sign that it has at the start of a step, by bisection."""
+        a, b = along.span
+        while (middle := (a + b) / 2) not in (a, b):
+            a, b = (middle, b) if self.sign(middle, along.state(middle)) == sign else (a, middle)
+        return b
 
     def _doubt(self, t, along):
         """By how much the least singular values at an instant may be wrong as the state is, (2,).
@@ -342,11 +352,13 @@ class _Along:
     def __init__(self, rank, stretch, k, before):
         self.rank, self.stretch, self.k, self.before = rank, stretch, k, before
         start, end = self.span = stretch.t[k : k + 2]
-        self.earlier = -1 if before is None else int(np.flatnonzero(np.append(before.t, start) == start)[0]) - 1
-        known = 0 <= self.earlier < len(before.t) - 1 if before is not None else False
-        length = start - before.t[self.earlier] if known else start - end
         self.t = np.linspace(start, end, PARTS + 1)
-        self.t = np.insert(self.t, int(not known), start - length * (1 / PARTS if known else NEXT))
+        if before is not None and start in before.t[1:]:
+            self.earlier = int(np.flatnonzero(before.t[1:] == start)[0])
+            part = max(1.0 / PARTS, 1.0 - np.append(0.0, before.parts)[-2])  # from the last inspected instant on
+            self.t = np.append(start - part * (start - before.t[self.earlier]), self.t)
+        else:
+            self.t = np.insert(self.t, 1, start + NEXT * (end - start))
         self.ends = [(t, self.state(t)) for t in self.span]
         sizes = zip(*(rank.norms(*place) for place in self.ends), strict=True)
         self.rows = [np.fmax(*np.nan_to_num(pair, posinf=0.0)) for pair in sizes]
@@ -354,8 +366,7 @@ class _Along:
         states = np.column_stack([self.ends[0][1]] * len(self.t))
         states[:, inside] = stretch.dense(np.full(inside.sum(), k), self.t[inside])
         states[:, -1] = self.ends[1][1]
-        if known:
-            states[:, 0] = self.state(self.t[0])
+        states[:, 0] = self.state(self.t[0])
         self.sizes = rank.along(self.t, states, self.rows)
 
     def state(self, t):
@@ -377,7 +388,7 @@ class _Along:
         """Where one of them has a least value: (which, t, what is nothing beside its neighbours)."""
         before, here, after = (self.sizes[:, a : a + len(self.t) - 2] for a in range(3))
         found, may = [], may_vanish(self.t, self.sizes)
-        for i, j in np.argwhere((here <= np.fmin(before, after)) & (here < np.fmax(before, after))):
+        for i, j in np.argwhere((here <= np.fmin(before, after)) & (here < (1 - NEGLIGIBLE) * np.fmax(before, after))):
             t = self._located(i, *self.t[[j, j + 2]]) if may[i, j] else self.t[j + 1]
             found.append((i, float(t), NEGLIGIBLE * max(before[i, j], after[i, j])))
         return sorted(found, key=lambda place: abs(place[1] - self.t[0]))
