@@ -19,7 +19,6 @@ DEGRADED = 0.02  # of its reference: a pivot below this is weak
 HELPS = 5.0  # times a weak pivot: the rank measure of a matrix for which other pivots are better
 NEGLIGIBLE = 1e-7  # of its reference: a pivot below this is zero, and one of which the reference is this is infinite
 HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
-AGAIN = 0.5  # of a weak pivot where the rank was followed: below this it is followed again
 LOST = 0.1  # of its best: below this, rank is why no step succeeds
 ERRS = 10.0  # times its tolerance, and the way to its invariants, by which a state may be wrong
 NEXT = 1e-3  # of a step: the distance from its start of an instant inside, where no step lies before
@@ -245,7 +244,7 @@ class Rank:
             return pole
         sudden, changed, least = self._pivots_in(stretch)
         for k in map(int, np.flatnonzero(sudden | (least < DEGRADED).any(axis=0))):
-            falls = least[:, k] < AGAIN * self.followed
+            falls = 2 * least[:, k] < self.followed  # a pivot that stays weak is looked at again where it has halved
             found = self._singular(stretch, k, before) if sudden[k] or falls.any() else None
             found = found or self._weak(stretch, k, changed[:, k], least[:, k])
             if found is not None:
