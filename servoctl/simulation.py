@@ -125,8 +125,9 @@ def simulate(
         Whether to show a bar; default: on a terminal, after a second. A callable receives the time reached [s]; an
         exception that it raises ends the simulation.
     compiled : bool, optional
-        True compiles at once what is not on disk, False takes no compiled code; both give the same bits again. By
-        default what is on disk is used, and the rest compiled when the steps so far have made up for that.
+        True compiles at once what is not on disk, False takes no compiled code, and no method that is C alone; both
+        give the same bits again. By default what is on disk is used, and the rest compiled when the steps so far have
+        made up for that.
 
     Returns
     -------

@@ -44,7 +44,8 @@ _locks = {}  # key -> lock: no two threads compile the same text
 _guard = threading.Lock()
 _warned = False
 _hanging = set()  # commands that did not answer, and are not asked again
-_calls = Counter()  # of what is not loaded, by key
+_calls = Counter()  # of this process, of what is not loaded, by key
+_earlier = {}  # those of earlier processes
 choice = contextvars.ContextVar("compiled, of `fixed`", default=None)
 
 
@@ -82,19 +83,20 @@ def library(text, level="-O1", exact=False, calls=math.inf, emitted=None):
     command, identity = _compiler()
     if choice.get() is False or os.environ.get("SERVOCTL_COMPILER") == "none":
         return None
+    if command is None:
+        return _without("No C compiler was found")
     key = hashlib.sha256("\0".join((text, level, str(exact), digest(), _machine(identity))).encode()).hexdigest()
     with _guard:
         lock = _locks.setdefault(key, threading.Lock())
     with lock:
         if key not in _loaded:
-            first = key not in _calls
-            _calls[key] += calls + (_told(key) if first else 0)
-            due = choice.get() or _calls[key] >= CALLS
-            found = _open(cache_directory() / f"{key}.so") if command and (first or due) else None
+            if first := key not in _calls:
+                _earlier[key] = _told(key)
+            _calls[key] += calls
+            due = choice.get() or _calls[key] + _earlier[key] >= CALLS
+            found = _open(cache_directory() / f"{key}.so") if first or due else None
             if found is None and not due:
                 return None
-            if command is None:
-                return _without("No C compiler was found")
             _loaded[key] = found or _build(*(emitted() if emitted else (text, level)), exact, f"{key}.so", command)
         return _loaded[key]
 
@@ -110,8 +112,9 @@ def _told(key):
 def _tell():
     """Leave the calls of what was not compiled to the next process, for which it may pay."""
     for key in _calls.keys() - _loaded.keys():
+        calls = _told(key) + _calls[key]
         with contextlib.suppress(OSError), replacing(cache_directory() / key) as temporary:
-            Path(temporary).write_text(repr(_calls[key]), encoding="utf-8")
+            Path(temporary).write_text(repr(calls), encoding="utf-8")
 
 
 def compiler():

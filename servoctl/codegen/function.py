@@ -23,7 +23,7 @@ from servoctl.codegen.paths import none_chosen
 from servoctl.errors import SpecificationError
 from servoctl.jets.branches import contains
 
-STEP = 6  # evaluations that take as long as what surrounds that of a Taylor step in Python
+STEP = 6  # evaluations that take as long as a Taylor step, or a block of a path, with what surrounds them in Python
 FULLY_OPTIMISED = 6_000  # statements of C: up to here -O3 takes at most 1.5 s; more are as fast with -O1
 ALONG_A_PATH = "-O2 -fno-tree-pre -fno-tree-vrp -fno-gcse -fno-tree-slp-vectorize"  # Newton: 3/4 of the time of -O3
 TAYLOR_COMPILED = 15_000  # operations: beyond, compiling takes as long as 50,000 steps that CasADi evaluates
@@ -219,7 +219,7 @@ class Compiled:
         nodes = self._array("nodes", nodes, (len(nodes), 1 + self.n_x + self.n_y))
         z = np.empty((self.n_y - self.sizes.get("pivots", 0), t.size))
         n, iterations = self._library.newton(t, nodes, p, z)
-        self._in_loops["_library"] += iterations if n < BLOCK else iterations / BLOCK + n % BLOCK
+        self._in_loops["_library"] += iterations if n < BLOCK else STEP * iterations / BLOCK + n % BLOCK
         return z[:, :n], iterations
 
     def taylor(self, t0, x0, ends, p, rtol, atol, max_steps, project_every=0):
@@ -254,13 +254,14 @@ class Compiled:
         or nothing is compiled.
         """
         self._require_loop("taylor")
-        self._place(self._library, start[0], start[1], p)
+        library = self._library
+        self._place(library, start[0], start[1], p)
         n, sizes = self.sizes["n"], self.sizes
         pivots = self.n_y - sizes["last"] * (n + (0 if sizes["plain"] else sizes["nq"]))
         lengths = n, 1, self.n_x, pivots, pivots, 1
         rows = sizes["nq"] + sizes["top"] * n
         times = np.ascontiguousarray(times, dtype=float)
-        found = self._library.whole(start[2], tolerances, most, times, net, (rows, sum(lengths)))
+        found = library.whole(start[2], tolerances, most, times, net, (rows, sum(lengths)))
         if found is None:
             return None
         ends = list(itertools.accumulate(lengths, initial=0))
@@ -332,9 +333,9 @@ class Compiled:
     def _loaded(self, name):
         """Evaluator by a library; another one, or CasADi, as long as its calls do not make up for compiling it."""
         found = vars(self).get(name)
-        if compiler.choice.get() is False:
+        if none_chosen():
             return self._interpreter
-        if found is None and (calls := self._in_loops[name]) and not none_chosen():
+        if found is None and ((calls := self._in_loops[name]) or compiler.choice.get()):
             self._in_loops[name] = 0
             identity, emitted = f"{name} {FULLY_OPTIMISED} {self.identity}", functools.partial(self._emitted, name)
             if (library := compiler.library(identity, calls=calls, emitted=emitted)) is not None:

@@ -77,8 +77,8 @@ class Followed:
 
 
 def none_chosen():
-    """Whether the process compiles nothing, by choice."""
-    return os.environ.get("SERVOCTL_COMPILER") == "none"
+    """Whether nothing is compiled, by choice: of the process, or of a call."""
+    return compiler.choice.get() is False or os.environ.get("SERVOCTL_COMPILER") == "none"
 
 
 def followed(address):

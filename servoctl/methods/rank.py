@@ -22,7 +22,7 @@ HOPELESS = 1e-9  # an equilibrated singular value below this leaves no digits
 LOST = 0.1  # of its best: below this, rank is why no step succeeds
 ERRS = 10.0  # times its tolerance, and the way to its invariants, by which a state may be wrong
 NEXT = 1e-3  # of a step: the distance from its start of an instant inside, where no step lies before
-PARTS = 8  # of a step with weak pivots, at whose ends singular values are taken
+SAMPLED = 8  # of a step with weak pivots, at whose ends singular values are taken
 VANISHES = "its rows or its directions become dependent"
 CLOSELY = {"xatol": 1e-10}  # of the distance between its neighbours, to which a least value is located
 
@@ -351,10 +351,10 @@ class _Along:
     def __init__(self, rank, stretch, k, before):
         self.rank, self.stretch, self.k, self.before = rank, stretch, k, before
         start, end = self.span = stretch.t[k : k + 2]
-        self.t = np.linspace(start, end, PARTS + 1)
+        self.t = np.linspace(start, end, SAMPLED + 1)
         if before is not None and start in before.t[1:]:
             self.earlier = int(np.flatnonzero(before.t[1:] == start)[0])
-            part = max(1.0 / PARTS, 1.0 - np.append(0.0, before.parts)[-2])  # from the last inspected instant on
+            part = max(1.0 / SAMPLED, 1.0 - np.append(0.0, before.parts)[-2])  # from the last inspected instant on
             self.t = np.append(start - part * (start - before.t[self.earlier]), self.t)
         else:
             self.t = np.insert(self.t, 1, start + NEXT * (end - start))
