@@ -69,6 +69,7 @@ class _Algebraic(Stepping):
             self.longest, self.direction = abs(t1 - t0) / STEPS, np.sign(t1 - t0)
             if self._at_once(cuts, x0, times):
                 return self.motion
+            self.tolerance = Tolerance(self.model, x0, *DEFAULT)
             self._start(t0, x0, t1)
             self.pending, self.resumed, self.motion.room = times, None, len(times)
             t, x = t0, x0
@@ -102,13 +103,12 @@ class _Algebraic(Stepping):
 
         Those of forces alone change the actuation, not the motion.
         """
-        self.tolerance = Tolerance(self.model, x, *DEFAULT)
         moves = self.model.once("switches of the motion", lambda: switched(self.model.reduction))
         self.family = switching(self.model) if moves else None
         if self.family is not None:
             branches = self.family.branches(t, x)
             self._use(self.family.at(branches))
-            self.switches = Switches(self.family, branches, self.length, 1, self.tolerance)
+            self.switches = Switches(self.family, branches, self.length, 1, Tolerance(self.model, x, *DEFAULT))
 
     def _advance(self, cuts, x):
         """Follow the solution as far as the pivots allow; the instant and the state from which it goes on."""
