@@ -155,7 +155,7 @@ class Compiled:
         t = self._array("t", np.broadcast_to(t, (n,)) if np.ndim(t) == 0 else t, (n,))
         p = self._array("p", p, (self.n_p, n) if np.ndim(p) == 2 else self._p_shape)
         y = np.empty((self.n_y, n))
-        self._in_loops["_lanes" if n > MANY_POINTS else "_library"] += n / BLOCK
+        self._in_loops["_lanes" if n > MANY_POINTS and "newton" not in self.loops else "_library"] += n / BLOCK
         (self._lanes if n > MANY_POINTS else self._library if self.loops else self._interpreter).grid(t, x, p, y)
         return y
 

@@ -22,11 +22,11 @@ def machine(f, points):
 
     CasADi has its own approximation of the inverse error function. It would be used at so many points now.
     """
-    if not {f.instruction_id(k) for k in range(f.n_instructions())} <= emit.SAME_BITS:
-        return False
     calls = points * f.n_instructions() / CALLS  # it is compiled for all functions, as long as one of so many
-    library = compiler.library(_written(TOGETHER), "-O3", True, calls)
-    return library and Machine(f, library.servoctl_machine)
+    if (library := compiler.library(_written(TOGETHER), "-O3", True, calls)) is None:
+        return None
+    used = {f.instruction_id(k) for k in range(f.n_instructions())}
+    return used <= emit.SAME_BITS and Machine(f, library.servoctl_machine)
 
 
 class Machine:

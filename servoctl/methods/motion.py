@@ -477,5 +477,6 @@ class Stepping:
 
     def _keep_last(self, t, x):
         """Record the last state, unless it is so near a singularity that γ^(s̄) is lost."""
-        if self.rank.measure(t, x) > VANISHING:
+        end = self.motion.stop.details.get("t", t)
+        if abs(end - self.span[0]) >= abs(t - self.span[0]) and self.rank.measure(t, x) > VANISHING:
             self.motion.add(self.model, [t], x[:, None], self._top(t, x)[:, None])

@@ -113,7 +113,7 @@ class Rank:
 
     def begin(self, model, t, pivots):
         """Start a piece at t [s] with pivots (n_g,) of a model; the first step is compared with them."""
-        self.model, self.reference, self.before = model, np.abs(pivots), None
+        self.model, self.reference, self.before = model, np.nan_to_num(np.abs(pivots), posinf=0.0), None
         self.recent = np.array([t]), pivots[:, None]  # the last two instants, and pivots there
         self.followed = np.full(len(pivots), np.inf)  # sizes of weak pivots where the rank was last followed
 
@@ -200,9 +200,10 @@ class Rank:
     def sign(self, t, x):
         """The sign of the determinant of [M -B; G 0], or 0 where other rows divide by pivots, which may change it."""
         L, Bt = self.matrices(t, x)
-        if not all(name.startswith(OF_CHOICE) for name in row_pivots(self.first)) or not np.isfinite(L).all():
-            return 0.0
         dependent = list(self.first.reduction.realisation.dependent)
+        square = L.shape[0] == L.shape[1] and len(dependent) == len(Bt)
+        if not (square and all(name.startswith(OF_CHOICE) for name in row_pivots(self.first)) and np.isfinite(L).all()):
+            return 0.0
         return float(np.linalg.slogdet(L)[0] * np.linalg.slogdet(Bt[:, dependent])[0])
 
     def measure(self, t, x):
@@ -243,14 +244,16 @@ class Rank:
         if pole is not None:
             return pole
         sudden, changed, least = self._pivots_in(stretch)
-        for k in map(int, np.flatnonzero(sudden | (least < DEGRADED).any(axis=0))):
+        weak = least < DEGRADED
+        for k in map(int, np.flatnonzero(sudden | weak.any(axis=0))):
+            self.followed[~weak[:, k - 1 : k].any(axis=1) & (k > 0)] = np.inf
             falls = 2 * least[:, k] < self.followed  # a pivot that stays weak is looked at again where it has halved
             found = self._singular(stretch, k, before) if sudden[k] or falls.any() else None
             found = found or self._weak(stretch, k, changed[:, k], least[:, k])
             if found is not None:
                 return found
             self.followed = np.where(falls, least[:, k], self.followed)
-        self.followed[least[:, -1] >= DEGRADED] = np.inf
+        self.followed[~weak[:, -1]] = np.inf
         return Fine(count)
 
     def _pivots_in(self, stretch):
@@ -306,7 +309,9 @@ class Rank:
         """The outcome of step k if the rank is lost in it: where a least value is zero, or from its start on."""
         along = _Along(self, stretch, k, stretch if k else before)
         places = [(along.value(t)[i], t, i, allowed) for i, t, allowed in along.least()]
-        value, t, i, allowed = min(places, default=(np.inf, along.span[1], 0, 0.0))
+        value, t, i, allowed = min(
+            (place for place in places if np.isfinite(place[0])), default=(np.inf, along.span[1], 0, 0.0)
+        )
         doubt, signs = self._doubt(t, along), [self.sign(*end) for end in along.ends]
         if signs[0] * signs[1] < 0:
             t = self._change_of_sign(along, signs[0])
@@ -315,8 +320,9 @@ class Rank:
             if not len(stays):
                 return None
             t = along.zero(stays[0])
-        end = t if (t - along.span[0]) * (t - along.span[1]) < 0 else along.span[0]
-        return Singular(k, end, along.state(end), t, VANISHES)
+        start, end = along.span
+        last = t if (t - start) * (t - end) < 0 else start
+        return Singular(k, last, along.state(t if abs(t - start) < abs(end - start) else end), t, VANISHES)
 
     def _change_of_sign(self, along, sign):
         """The instant at which the determinant changes the sign that it has at the start of a step, by bisection."""
@@ -381,7 +387,8 @@ class _Along:
     def zero(self, i):
         """Where one of them is zero if it falls on as in the step, else the start of the step."""
         (start, end), first, last = self.span, self.sizes[i, 1], self.sizes[i, -1]
-        return start + (end - start) * first / (first - last) if first > last else start
+        part = first / (first - last) if first > last else 0.0
+        return start + (end - start) * part if part < SAMPLED else start
 
     def least(self):
         """Where one of them has a least value: (which, t, what is nothing beside its neighbours)."""

@@ -474,7 +474,9 @@ class TaylorSteps(Stepping):
             if steps == self.most:
                 order, method = self.last - self.top + 1, getattr(self.settings, "for_stiff", None)
                 leave_if_unsuited(self, method, order / np.e, t, x, interpreted=self.f.too_long)
-            if not fine and self._follow(outcome):
+            if not fine:
+                self._follow(outcome)
+            if weak:
                 times = self._sample(log.step(steps - 1), times, a)
             elif fine and failed:
                 self._fail(a, x, "its steps vanish or are not finite")
@@ -499,10 +501,12 @@ class TaylorSteps(Stepping):
         if not len(h):
             self.inside = np.zeros((len(log.outputs) - self.n_c, 0))
             return 0
-        k, at = self._instants(log)
+        k, at, inside = self._instants(log)
         jets = log.jets(k, at, self.top)
         values = self.rates.grid(at, jets[: self.n_x], self.model.p)
-        rates, self.inside = values[self.n_x - n : self.n_x], values[self.n_x :, : len(INSIDE) * len(h)]
+        rates, pivots = values[self.n_x - n : self.n_x], values[self.n_x :]
+        self.inside = np.repeat(log.outputs[self.n_c :], len(INSIDE), axis=1)
+        self.inside[:, inside] = pivots[:, : inside.sum()]
         off, top = np.abs(rates - jets[-n:]), np.abs(jets[-n:])
         rtol, (atol, weights) = self.tolerances[0], weighted(self.tolerances[1])
         h, last, wrong = np.abs(h), self.f.sizes["last"], np.zeros(len(k), bool)
@@ -540,7 +544,7 @@ class TaylorSteps(Stepping):
         return slice(self.nq + (level - 1) * self.n, self.nq + level * self.n) if level else slice(0, self.nq)
 
     def _instants(self, log):
-        """Steps and instants within them at which series are compared with the equations."""
+        """Steps and instants in them at which series are compared with the equations; which of INSIDE these include."""
         t, h = log.t, np.diff(log.t)
         each, further, _ = net(t, self.length / RESOLUTION, 1)
         k = np.concatenate([np.repeat(np.arange(len(h)), len(INSIDE)), each])
@@ -548,7 +552,7 @@ class TaylorSteps(Stepping):
         within = at != t[k]
         if self.knots:  # where paths have other pieces
             within &= ~np.isin(at, [end for end in t.tolist() if end in self.knots])
-        return k[within], at[within]
+        return k[within], at[within], within[: len(INSIDE) * len(h)]
 
     def _stretch(self, log):
         """The steps to be inspected, with the pivots at their ends and where their series were."""
