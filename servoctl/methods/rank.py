@@ -23,7 +23,7 @@ LOST = 0.1  # of its best: below this, rank is why no step succeeds
 ERRS = 10.0  # times its tolerance, and the way to its invariants, by which a state may be wrong
 NEXT = 1e-3  # of a step: the distance from its start of an instant inside, where no step lies before
 SAMPLED = 8  # of a step with weak pivots, at whose ends singular values are taken
-VANISHES = "its rows or its directions become dependent"
+VANISHES = "rank is lost there"
 CLOSELY = {"xatol": 1e-10}  # of the distance between its neighbours, to which a least value is located
 
 
@@ -59,7 +59,8 @@ class Stretch:
     """Steps with ends t (S + 1,) [s], states x (n_x, S + 1) there, and pivots (n_g, S, m) after parts of each step.
 
     The last of the parts (m,) is 1, the step's end. `dense` gives states (n_x, N) from steps k (N,) and times (N,) [s],
-    `slope` their derivatives. Steps that `cross` a zero of a pivot are as accurate as others.
+    `slope` their derivatives. Steps that `cross` a zero of a pivot are as accurate as others; within those of a series
+    the motion `resumes`.
     """
 
     t: np.ndarray
@@ -69,6 +70,7 @@ class Stretch:
     dense: object
     crosses: bool = False
     slope: object = None
+    resumes: bool = False
 
     def first(self, count):
         """The first steps alone."""
@@ -303,7 +305,15 @@ class Rank:
         if not len(least) or not changed.any() and self.measure(t, x) < HELPS * max(least.min(), NEGLIGIBLE):
             return None
         steps = k + stretch.crosses
-        return Weak(steps, stretch.t[steps], stretch.x[:, steps])
+        t = self._strong_until(stretch, k) if stretch.resumes else stretch.t[steps]
+        return Weak(steps, t, stretch.state(k, t))
+
+    def _strong_until(self, stretch, k):
+        """The last inspected instant of step k before a pivot is weak or has changed its sign."""
+        pivots = stretch.pivots[:, k]
+        strong = pivots * np.sign(pivots[:, :1]) >= DEGRADED * self.reference[:, None]
+        good = int(np.argmin(np.append(strong.all(axis=0), False)))
+        return stretch.t[k] + (stretch.parts[good - 1] * (stretch.t[k + 1] - stretch.t[k]) if good else 0.0)
 
     def _singular(self, stretch, k, before):
         """The outcome of step k if the rank is lost in it: where a least value is zero, or from its start on."""

@@ -464,21 +464,18 @@ class TaylorSteps(Stepping):
             self.motion.count(steps=steps, nfev=steps)
             if isinstance(outcome, End) and outcome.event:  # which is the last sample
                 times = np.union1d(times, outcome.t)[:: 1 if t[-1] >= t[0] else -1]
-            weak = isinstance(outcome, Weak)  # a step in which a pivot vanishes is sampled with the next pivots
-            times = self._sample(log, times, t[steps - weak] if fine or weak else outcome.t)
+            times = self._sample(log, times, t[steps] if fine else outcome.t)
             if isinstance(outcome, End):
                 self._turn(outcome, b)
                 return outcome.t, outcome.x
-            a, x = t[steps], states[:, steps].copy()
+            a, x = (outcome.t, outcome.x) if isinstance(outcome, Weak) else (t[steps], states[:, steps].copy())
             self.progress(a)
             if steps == self.most:
                 order, method = self.last - self.top + 1, getattr(self.settings, "for_stiff", None)
                 leave_if_unsuited(self, method, order / np.e, t, x, interpreted=self.f.too_long)
             if not fine:
                 self._follow(outcome)
-            if weak:
-                times = self._sample(log.step(steps - 1), times, a)
-            elif fine and failed:
+            elif failed:
                 self._fail(a, x, "its steps vanish or are not finite")
         if len(times) and self.motion.stop is None:
             row = np.concatenate([[a], x, self._outputs(a, x)])
@@ -561,7 +558,7 @@ class TaylorSteps(Stepping):
         inside = self.inside[:, : count * len(INSIDE)].reshape(n_g, count, len(INSIDE))
         ends = np.column_stack([pivots[:, 1:], self._pivots(t[-1], states[:, -1])]) if count else pivots
         every, parts = np.concatenate([inside, ends[:, :, None]], axis=2), np.append(INSIDE, 1.0)
-        return Stretch(t, states, parts, every, lambda k, s: log.jets(k, s, self.top - 1), crosses=True)
+        return Stretch(t, states, parts, every, lambda k, s: log.jets(k, s, self.top - 1), resumes=True)
 
     def _sample(self, log, pending, end):
         """Keep the steps, record the pending samples up to `end` and return those that remain."""
@@ -580,7 +577,7 @@ class TaylorSteps(Stepping):
 
     def _dense(self, log):
         """What gives the jets within the steps of a log."""
-        by_rows, jets = "settled" in self.f.others and self.f is log.f, self.settings.jets or 0
+        by_rows, jets = "settled" in self.f.others, self.settings.jets or 0
         levels = max(jets, self.top - (not by_rows))
         # more accurate than as a derivative of the series
         rates = self.rates if levels < self.top or self.doubted else None
@@ -638,10 +635,6 @@ class _Log:
     def first(self, count):
         """The first steps alone."""
         return replace(self, rows=self.rows[: count + 1])
-
-    def step(self, k):
-        """Step k alone."""
-        return replace(self, rows=self.rows[k : k + 2])
 
     def jets(self, k, t, top, by_rows=False):
         """Jets q, γ', ..., γ^(top) at times t (N,) in the steps k (N,), (nq + top n, N); see `Compiled.jets`."""
