@@ -304,7 +304,7 @@ class Rank:
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
         if not len(least) or not changed.any() and self.measure(t, x) < HELPS * max(least.min(), NEGLIGIBLE):
             return None
-        steps = k + stretch.crosses
+        steps = k + (stretch.crosses and bool(np.isfinite(stretch.pivots[:, k, -1]).all()))
         t = self._strong_until(stretch, k) if stretch.resumes else stretch.t[steps]
         return Weak(steps, t, stretch.state(k, t))
 
