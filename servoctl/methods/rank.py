@@ -304,7 +304,8 @@ class Rank:
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
         if not len(least) or not changed.any() and self.measure(t, x) < HELPS * max(least.min(), NEGLIGIBLE):
             return None
-        steps = k + (stretch.crosses and bool(np.isfinite(stretch.pivots[:, k, -1]).all()))
+        back = stretch.t[k] != self.start[0] and not np.isfinite(stretch.pivots[:, k, -1]).all()
+        steps = k + (stretch.crosses and not back)
         t = self._strong_until(stretch, k) if stretch.resumes else stretch.t[steps]
         return Weak(steps, t, stretch.state(k, t))
 
@@ -312,7 +313,7 @@ class Rank:
         """The last inspected instant of step k before a pivot is weak or has changed its sign."""
         pivots = stretch.pivots[:, k]
         strong = pivots * np.sign(pivots[:, :1]) >= DEGRADED * self.reference[:, None]
-        good = int(np.argmin(np.append(strong.all(axis=0), False)))
+        good = int(np.argmin(np.append((strong | ~np.isfinite(pivots)).all(axis=0), False)))
         return stretch.t[k] + (stretch.parts[good - 1] * (stretch.t[k + 1] - stretch.t[k]) if good else 0.0)
 
     def _singular(self, stretch, k, before):
