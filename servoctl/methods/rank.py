@@ -328,7 +328,7 @@ class Rank:
             t = self._change_of_sign(along, signs[0])
         elif not value <= allowed + doubt[i]:
             stays = np.flatnonzero((along.sizes <= doubt[:, None]).all(axis=1))
-            if not len(stays) or not np.isfinite(stretch.pivots[:, k]).all():
+            if not len(stays) or stretch.t[k] == self.start[0]:
                 return None
             t = along.zero(stays[0])
         start, end = along.span
