@@ -304,8 +304,7 @@ class Rank:
         t, x = stretch.t[k + 1], stretch.x[:, k + 1]
         if not len(least) or not changed.any() and self.measure(t, x) < HELPS * max(least.min(), NEGLIGIBLE):
             return None
-        back = stretch.t[k] != self.start[0] and not np.isfinite(stretch.pivots[:, k, -1]).all()
-        steps = k + (stretch.crosses and not back)
+        steps = k + (stretch.crosses and bool(np.isfinite(stretch.pivots[:, k, -1]).all()))
         t = self._strong_until(stretch, k) if stretch.resumes else stretch.t[steps]
         return Weak(steps, t, stretch.state(k, t))
 
@@ -313,25 +312,23 @@ class Rank:
         """The last inspected instant of step k before a pivot is weak or has changed its sign."""
         pivots = stretch.pivots[:, k]
         strong = pivots * np.sign(pivots[:, :1]) >= DEGRADED * self.reference[:, None]
-        good = int(np.argmin(np.append((strong | ~np.isfinite(pivots)).all(axis=0), False)))
+        good = int(np.argmin(np.append(strong.all(axis=0), False)))
         return stretch.t[k] + (stretch.parts[good - 1] * (stretch.t[k + 1] - stretch.t[k]) if good else 0.0)
 
     def _singular(self, stretch, k, before):
         """The outcome of step k if the rank is lost in it: where a least value is zero, or from its start on."""
         along = _Along(self, stretch, k, stretch if k else before)
-        places = [(along.value(t)[i], t, i, allowed) for i, t, allowed in along.least()]
-        value, t, i, allowed = min(
-            (place for place in places if np.isfinite(place[0])), default=(np.inf, along.span[1], 0, 0.0)
-        )
-        doubt, signs = self._doubt(t, along), [self.sign(*end) for end in along.ends]
+        (start, end), signs = along.span, [self.sign(*place) for place in along.ends]
         if signs[0] * signs[1] < 0:
             t = self._change_of_sign(along, signs[0])
-        elif not value <= allowed + doubt[i]:
-            stays = np.flatnonzero((along.sizes <= doubt[:, None]).all(axis=1))
-            if not len(stays) or stretch.t[k] == self.start[0]:
-                return None
-            t = along.zero(stays[0])
-        start, end = along.span
+        else:
+            value, t, i, allowed = min(along.least(), default=(np.inf, end, 0, 0.0))
+            doubt = self._doubt(t, along)
+            if not value <= allowed + doubt[i]:
+                stays = np.flatnonzero((along.sizes <= doubt[:, None]).all(axis=1))
+                if not len(stays) or start == self.start[0]:
+                    return None
+                t = along.zero(stays[0])
         last = t if (t - start) * (t - end) < 0 else start
         return Singular(k, last, along.state(t if abs(t - start) < abs(end - start) else end), t, VANISHES)
 
@@ -402,19 +399,21 @@ class _Along:
         return start + (end - start) * part if part < SAMPLED else start
 
     def least(self):
-        """Where one of them has a least value: (which, t, what is nothing beside its neighbours)."""
+        """Their least values: (value, t, which of them, what is nothing beside its neighbours)."""
         before, here, after = (self.sizes[:, a : a + len(self.t) - 2] for a in range(3))
         found, may = [], may_vanish(self.t, self.sizes)
         for i, j in np.argwhere((here <= np.fmin(before, after)) & (here < (1 - NEGLIGIBLE) * np.fmax(before, after))):
-            t = self._located(i, *self.t[[j, j + 2]]) if may[i, j] else self.t[j + 1]
-            found.append((i, float(t), NEGLIGIBLE * max(before[i, j], after[i, j])))
-        return sorted(found, key=lambda place: abs(place[1] - self.t[0]))
+            value, t = self._located(i, *self.t[[j, j + 2]]) if may[i, j] else (here[i, j], self.t[j + 1])
+            if np.isfinite(value):
+                found.append((value, float(t), i, NEGLIGIBLE * max(before[i, j], after[i, j])))
+        return found
 
     def _located(self, i, a, b):
-        """The instant between two at which one of them is least."""
+        """The least value of one of them between two instants, and where that is."""
         from scipy.optimize import minimize_scalar
 
         def value(part):
             return self.value(a + part * (b - a))[i]
 
-        return a + minimize_scalar(value, bounds=(0, 1), method="bounded", options=CLOSELY).x * (b - a)
+        found = minimize_scalar(value, bounds=(0, 1), method="bounded", options=CLOSELY)
+        return found.fun, a + found.x * (b - a)
